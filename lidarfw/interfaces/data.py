@@ -1,0 +1,61 @@
+"""Interfaces of the data side: Dataset and Transform. Importing them does not import torch."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from lidarfw.types import DataSpec, Frame, FrameMeta
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+class Dataset(ABC):
+    """Frames of one split.
+
+    `__init__` takes keyword-only options, `split` among them, and must not touch the disk: `spec`
+    is asked before any file is there. `prepare` may download, generate or index.
+    """
+
+    spec: DataSpec
+    split: str  # train, val, test, or what the dataset names
+
+    def prepare(self) -> None:
+        """Make the files ready; called once, on one process, before the first frame is read."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def __getitem__(self, index: int) -> Frame: ...
+
+    def meta(self, index: int) -> FrameMeta:
+        """Sequence, index and id of a frame without reading its sensor data, for samplers."""
+        return FrameMeta(id=str(index), sequence="", index=index)
+
+    def sequences(self) -> list[Sequence[int]]:
+        """Frame numbers of each sequence in order of time. Default: all frames are one sequence."""
+        return [range(len(self))]
+
+
+class Transform(ABC):
+    """Changes a frame on a CPU worker: augmentation, or another representation of the data.
+
+    `__init__` takes keyword-only options. A transform that also needs the dataset (ground-truth
+    sampling, say) gets it by `attach`.
+    """
+
+    train_only: bool = False  # augmentations are left out in evaluation and prediction
+
+    @abstractmethod
+    def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        """The changed frame. All randomness comes from `rng`, which depends on (seed, epoch, index) alone."""
+
+    def spec(self, data: DataSpec) -> DataSpec:
+        """The data spec after this transform. Default: unchanged."""
+        return data
+
+    def attach(self, dataset: Dataset) -> None:
+        """Told once which dataset the frames come from, after `prepare` and before the first call."""
