@@ -78,6 +78,7 @@ class FrameResult:
     meta: FrameMeta
     predictions: dict[str, Any] = field(default_factory=dict)  # by the component that made it: "head.center": Boxes
     tracks: Tracks | None = None
+    targets: Targets | None = None  # ground truth of the frame in evaluation, for metrics; None at inference
 
     def of(self, kind: type[T]) -> T:
         """The only prediction of a kind; LookupError where there is none or more than one."""

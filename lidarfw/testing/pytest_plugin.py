@@ -1,0 +1,1 @@
+"""Fixtures for tests of components (loaded by pytest through its entry point)."""
