@@ -15,6 +15,10 @@ class ConfigError(LidarfwError):
     """A config key or value is wrong."""
 
 
+class GeometryError(LidarfwError, ValueError):
+    """A grid, range view or camera cannot exist with these numbers."""
+
+
 class AssemblyError(LidarfwError):
     """The chosen components do not fit together."""
 
