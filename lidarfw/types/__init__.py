@@ -6,7 +6,7 @@ None of these modules imports torch before a tensor is touched.
 """
 
 from lidarfw.types.features import BEV, Image, Points, RangeImage, Voxels
-from lidarfw.types.frame import Batch, Frame, FrameMeta, FrameResult, Targets, collate
+from lidarfw.types.frame import Batch, Frame, FrameMeta, FrameResult, Targets, collate, take
 from lidarfw.types.geometry import Camera, Grid, RangeView
 from lidarfw.types.predictions import Boxes, Descriptors, Matches, PointLabels, Poses, SceneCoords, Tracks
 from lidarfw.types.record import Record, Rows
@@ -16,5 +16,5 @@ __all__ = [
     "BEV", "FEATURES", "PREDICTIONS", "VOCABULARY", "Batch", "Boxes", "Camera", "DataSpec", "Descriptors", "Frame",
     "FrameMeta", "FrameResult", "Grid", "Image", "Matches", "PointLabels", "Points", "Poses", "RangeImage",
     "RangeView", "Record", "Rows", "SceneCoords", "Spec", "Stride", "Sweeps", "Tap", "Targets", "Tracks", "Voxels",
-    "collate",
+    "collate", "take",
 ]  # fmt: skip

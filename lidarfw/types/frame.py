@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from lidarfw._lazy import LazyModule
 from lidarfw.types.features import BEV, Image, Points, RangeImage
 from lidarfw.types.geometry import Camera
-from lidarfw.types.predictions import Boxes, PointLabels, Poses, Tracks
+from lidarfw.types.predictions import Boxes, Descriptors, PointLabels, Poses, Tracks
 from lidarfw.types.record import Record, Rows
 
 if TYPE_CHECKING:
@@ -79,6 +79,7 @@ class FrameResult:
     predictions: dict[str, Any] = field(default_factory=dict)  # by the component that made it: "head.center": Boxes
     tracks: Tracks | None = None
     targets: Targets | None = None  # ground truth of the frame in evaluation, for metrics; None at inference
+    inputs: dict[str, Any] = field(default_factory=dict)  # what the model saw: "points": Points, ...
 
     def of(self, kind: type[T]) -> T:
         """The only prediction of a kind; LookupError where there is none or more than one."""
@@ -91,6 +92,34 @@ class FrameResult:
     def with_prediction(self, old: Any, new: Any) -> FrameResult:
         """A copy in which the prediction object `old` is replaced by `new`."""
         return replace(self, predictions={n: new if v is old else v for n, v in self.predictions.items()})
+
+
+def take(record: Any, number: int) -> Any:
+    """Sample `number` of a batched input, prediction or target, as a batch of one; None stays None."""
+    if record is None:
+        return None
+    if isinstance(record, Rows):
+        return record.sample(number)
+    if isinstance(record, Image):
+        return Image(record.features[number : number + 1], record.cameras[number : number + 1], record.stride)
+    if isinstance(record, Targets):
+        return Targets(**{f.name: take(getattr(record, f.name), number) for f in fields(Targets)})
+    if isinstance(record, Tracks):
+        rows = record.boxes.batch == number
+        return Tracks(record.boxes.sample(number), record.id[rows], None if record.moving is None else record.moving[rows])
+    if isinstance(record, RangeImage):
+        return _take_range_image(record, number)
+    if isinstance(record, Descriptors):
+        return Descriptors(record.vector[number : number + 1], record.modality[number : number + 1])
+    return record.map(lambda tensor: tensor[number : number + 1])
+
+
+def _take_range_image(record: RangeImage, number: int) -> RangeImage:
+    size = record.view.height * record.view.width
+    # a point outside the view has no sample: only points inside are kept
+    pixel = record.pixel[(record.pixel >= number * size) & (record.pixel < (number + 1) * size)] - number * size
+    one = slice(number, number + 1)
+    return RangeImage(record.features[one], record.xyz[one], record.mask[one], pixel, record.view)
 
 
 def _collate_records(records: Sequence[Any]) -> Any:
@@ -128,4 +157,4 @@ def collate(frames: Sequence[Frame]) -> Batch:
     return Batch(inputs, Targets(**targets), [f.meta for f in frames])
 
 
-__all__ = ["Batch", "Frame", "FrameMeta", "FrameResult", "Points", "Targets", "collate"]
+__all__ = ["Batch", "Frame", "FrameMeta", "FrameResult", "Points", "Targets", "collate", "take"]

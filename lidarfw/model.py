@@ -1,0 +1,197 @@
+"""The model of a plan: runs the components in order, collects losses, decodes and post-processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor, nn
+
+from lidarfw.assembly import Plan, Ref, Step
+from lidarfw.declaration import Parameter
+from lidarfw.interfaces import Filter
+from lidarfw.types import Batch, FrameResult, Record, take
+
+if TYPE_CHECKING:
+    from lidarfw.streaming import Stream
+
+_MODULE_SLOTS = ("backbone", "neck", "head", "loss", "postprocessor", "filter", "tracker", "retriever")
+
+
+class PerceptionModel(nn.Module):
+    """Components wired by a plan. Parameter names are config names: `head.center.shared.weight`."""
+
+    def __init__(self, plan: Plan, modules: dict[str, Any]) -> None:
+        super().__init__()
+        self.plan = plan
+        for slot in _MODULE_SLOTS:
+            setattr(self, slot, nn.ModuleDict({step.name: modules[step.id] for step in plan.of(slot)}))
+        # metrics hold figures, not weights: they stay out of state_dict
+        self._metrics: dict[str, Any] = {step.name: modules[step.id] for step in plan.of("metric")}
+
+    def component(self, step: Step) -> Any:
+        """The module of a step."""
+        return self._metrics[step.name] if step.slot == "metric" else getattr(self, step.slot)[step.name]
+
+    # features and raw outputs
+
+    def forward(self, batch: Batch) -> dict[str, Any]:
+        """What every backbone, neck and head (and trainable tracker, in training) returns, by name ("head.center")."""
+        outputs: dict[str, Any] = {f"data.{name}": value for name, value in batch.inputs.items()}
+        for slot in ("backbone", "neck", "head"):
+            for step in self.plan.of(slot):
+                outputs[step.id] = self._call(step, step.declared.takes, outputs, batch)
+        for step in self.plan.of("tracker"):
+            if self.training and step.declared.trainable is not None:
+                outputs[step.id] = self._call(step, step.declared.trainable, outputs, batch)
+        return outputs
+
+    def losses(self, outputs: dict[str, Any], batch: Batch, progress: float = 1.0) -> dict[str, dict[str, Tensor]]:
+        """Weighted terms of every loss: name -> term -> scalar. `progress` is the share of training done, for ramps."""
+        terms = {}
+        for step in self.plan.of("loss"):
+            weight = step.weight * (min(1.0, progress / step.ramp) if step.ramp > 0 else 1.0)
+            if weight != 0:
+                found = self._call(step, step.declared.takes, outputs, batch)
+                terms[step.name] = {name: weight * term for name, term in found.items()}
+        return terms
+
+    # predictions
+
+    def predict(self, batch: Batch) -> list[FrameResult]:
+        """Forward, decode and post-process: one result per frame."""
+        return self.decode(self(batch), batch)
+
+    def decode(self, outputs: dict[str, Any], batch: Batch) -> list[FrameResult]:
+        """Predictions of every head that no later one replaced, post-processed, one result per frame."""
+        heads = {step.id for step in self.plan.of("head")}
+        final = {ref.producer for ref in self.plan.visible if ref.producer in heads}
+        predicted = {name: self._decoded(name, outputs) for name in outputs if name in final}
+        for step in self.plan.of("postprocessor"):
+            arguments = {p.name: self._argument(step, p, {**outputs, **predicted}, predicted) for p in step.declared.takes}
+            result = self.component(step)(**arguments, **self._special(step, batch))
+            replaced = step.replaces
+            predicted[replaced[0].producer if replaced else step.id] = result
+        return [self._result(predicted, batch, number) for number in range(len(batch))]
+
+    def _result(self, predicted: dict[str, Any], batch: Batch, number: int) -> FrameResult:
+        predictions = {name: take(value, number) for name, value in predicted.items()}
+        inputs = {name: take(value, number) for name, value in batch.inputs.items()}
+        return FrameResult(batch.meta[number], predictions, None, take(batch.targets, number), inputs)
+
+    # wiring at run time
+
+    def _call(self, step: Step, parameters: Iterable[Parameter], outputs: dict[str, Any], batch: Batch) -> Any:
+        arguments = {p.name: self._argument(step, p, outputs) for p in parameters}
+        return self.component(step)(**arguments, **self._special(step, batch))
+
+    def _special(self, step: Step, batch: Batch) -> dict[str, Any]:
+        """`targets` (losses always, other components in training only) and `meta`, where asked for."""
+        special: dict[str, Any] = {}
+        if "targets" in step.declared.special:
+            special["targets"] = batch.targets if self.training or step.slot == "loss" else None
+        if "meta" in step.declared.special:
+            special["meta"] = batch.meta
+        return special
+
+    def _argument(self, step: Step, p: Parameter, outputs: dict[str, Any], predicted: dict[str, Any] | None = None) -> Any:
+        refs = step.takes[p.name]
+        values = [self._value(ref, outputs, predicted) for ref in refs]
+        if p.form == "dict":
+            return {ref.producer.partition(".")[2]: value for ref, value in zip(refs, values, strict=True)}
+        if not values:
+            return None
+        levels = [v for value in values for v in (value if isinstance(value, list) else [value])]
+        if p.form == "list":
+            return levels
+        if p.stride is not None and len(levels) > 1:
+            return next(level for level in levels if level.stride == p.stride)
+        return max(levels, key=lambda level: level.stride) if len(levels) > 1 else levels[0]
+
+    def _value(self, ref: Ref, outputs: dict[str, Any], predicted: dict[str, Any] | None) -> Any:
+        if predicted is not None and ref.item == "value" and ref.producer in predicted:
+            return predicted[ref.producer]
+        value = outputs[ref.producer]
+        if ref.item == "output":
+            return value
+        if ref.item == "tap":
+            return value.tap
+        if ref.producer.startswith("head."):
+            return self._decoded(ref.producer, outputs)
+        return next(part for part in value if _is(part, ref.kind)) if isinstance(value, tuple) else value
+
+    def _decoded(self, head: str, outputs: dict[str, Any]) -> Any:
+        """The prediction of a head, cut from the graph; decoded once per batch."""
+        key = f"{head}.decoded"
+        if key not in outputs:
+            decoded: Record = self.head[head.partition(".")[2]].decode(outputs[head])  # type: ignore[operator]
+            outputs[key] = decoded.detach()
+        return outputs[key]
+
+    # streams
+
+    @property
+    def filters(self) -> dict[str, Filter]:
+        """Filters in order, then the tracker, by name ("filter.bayes")."""
+        return {step.id: self.component(step) for slot in ("filter", "tracker") for step in self.plan.of(slot)}
+
+    def filter_arguments(self, name: str, result: FrameResult) -> dict[str, Any]:
+        """What a filter's or tracker's `step` takes beside state and frame."""
+        step = next(step for step in self.plan.steps if step.id == name)
+        return self._from_result(step, result)
+
+    def stream(self) -> Stream:
+        """A stream over this model: state of its filters and tracker for one vehicle."""
+        from lidarfw.streaming import Stream
+
+        return Stream(self)
+
+    def _from_result(self, step: Step, result: FrameResult) -> dict[str, Any]:
+        found: dict[str, Any] = {f"data.{name}": value for name, value in result.inputs.items()}
+        found |= result.predictions
+        found |= {step.id: result.tracks for step in self.plan.of("tracker")}
+        arguments = {p.name: self._argument(step, p, found, found) for p in step.declared.takes}
+        if "targets" in step.declared.special:
+            arguments["targets"] = result.targets
+        if "meta" in step.declared.special:
+            arguments["meta"] = [result.meta]
+        return arguments
+
+    # metrics
+
+    def update_metrics(self, results: list[FrameResult]) -> None:
+        """Count finished frames in."""
+        for result in results:
+            for step in self.plan.of("metric"):
+                self.component(step).update(**self._from_result(step, result))
+
+    def compute_metrics(self) -> dict[str, float]:
+        """All figures, as "metric/key"."""
+        figures = {}
+        for name, metric in self._metrics.items():
+            figures |= {f"{name}/{key}": float(value) for key, value in metric.compute().items()}
+        return figures
+
+    def reset_metrics(self) -> None:
+        """Forget all counts."""
+        for metric in self._metrics.values():
+            metric.reset()
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The metrics by name."""
+        return self._metrics
+
+    @property
+    def monitor(self) -> str | None:
+        """The figure that stands for the run: `monitor` of the first metric, as "metric/key"."""
+        for name, metric in self._metrics.items():
+            return f"{name}/{metric.monitor}"
+        return None
+
+
+def _is(value: Any, kind: type) -> bool:
+    return isinstance(value[0] if isinstance(value, list) and value else value, kind)
+
+
+__all__ = ["PerceptionModel"]
