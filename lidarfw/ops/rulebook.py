@@ -1,0 +1,264 @@
+"""Rulebooks: which input row meets which output row under which element of the kernel.
+
+A rulebook depends on coordinates and kernel only. It is made once and kept in `Voxels.cache`, so every
+layer of equal kernel on the same cells shares it, whatever the layers are called.
+
+Sites are numbered by the key of a grid with a margin around it, so a neighbour is key + constant and
+never wraps to another line; the order of the keys is the canonical order.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import product
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from lidarfw.ops.cells import cell_index, cell_key, key_type, row_starts
+from lidarfw.types import Voxels
+
+Triple = tuple[int, int, int]
+
+_TABLE_CELLS = 2**24  # a dense lookup table of up to so many cells (64 MB) is faster than searching
+_local = threading.local()
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """Geometry of a convolution, each as (z, y, x)."""
+
+    size: Triple
+    stride: Triple = (1, 1, 1)
+    padding: Triple = (0, 0, 0)
+    dilation: Triple = (1, 1, 1)
+
+    @property
+    def volume(self) -> int:
+        return self.size[0] * self.size[1] * self.size[2]
+
+    def output_shape(self, shape: Triple) -> Triple:
+        """floor((n + 2 p - d (k - 1) - 1) / s) + 1 along each axis."""
+        axes = zip(shape, self.size, self.stride, self.padding, self.dilation, strict=True)
+        depth, height, width = ((n + 2 * p - d * (k - 1) - 1) // s + 1 for n, k, s, p, d in axes)
+        return depth, height, width
+
+
+@dataclass
+class Rulebook:
+    """Pairs of input and output rows, grouped by kernel element; each group ascends in both."""
+
+    inputs: Tensor  # (P,) int32 row of the input
+    outputs: Tensor  # (P,) int32 row of the output
+    elements: tuple[int, ...]  # kernel element of each group
+    counts: tuple[int, ...]  # pairs in each group
+    num_inputs: int
+    num_outputs: int
+    symmetric: bool = False  # submanifold: the pairs of element k are those of its mirror image, swapped
+    volume: int = 0
+    order: Tensor | None = None  # (P,) int32 pairs sorted by output
+    starts: Tensor | None = None  # (num_outputs + 1,) int32: output r owns order[starts[r]:starts[r + 1]]
+    _transposed: Rulebook | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return int(self.inputs.shape[0])
+
+    def by_output(self) -> tuple[Tensor, Tensor]:
+        """`order` and `starts`, made at first use."""
+        if self.order is None or self.starts is None:
+            self.order = torch.sort(self.outputs, stable=True)[1].int()
+            self.starts = row_starts(torch.bincount(self.outputs, minlength=self.num_outputs)).int()
+        return self.order, self.starts
+
+    def transposed(self) -> Rulebook:
+        """The rulebook from outputs to inputs, for gradients and inverse convolution.
+
+        Of a submanifold convolution it holds the same pairs, under mirrored kernel elements.
+        """
+        if self._transposed is None:
+            if self.symmetric:
+                mirrored = tuple(self.volume - 1 - e for e in self.elements)
+                self._transposed = Rulebook(
+                    self.inputs, self.outputs, mirrored, self.counts, self.num_inputs, self.num_outputs, True,
+                    self.volume, *self.by_output(),
+                )  # fmt: skip
+            else:
+                self._transposed = Rulebook(
+                    self.outputs, self.inputs, self.elements, self.counts, self.num_outputs, self.num_inputs,
+                    False, self.volume,
+                )  # fmt: skip
+            self._transposed._transposed = self
+        return self._transposed
+
+
+@dataclass
+class _Sites:
+    """The cells of a Voxels as separate vectors; kept in its cache."""
+
+    index: Tensor  # the index that this was made of, to notice a replaced one
+    columns: tuple[Tensor, Tensor, Tensor, Tensor]  # b, z, y, x, each (N,), of the narrowest integer type
+
+
+def _sites(voxels: Voxels) -> _Sites:
+    """The sites of the voxels; drops rulebooks of other cells from the cache."""
+    known = voxels.cache.get("sites")
+    if isinstance(known, _Sites) and known.index is voxels.index:
+        return known
+    voxels.cache.clear()
+    cells = voxels.batch_size * voxels.shape[0] * voxels.shape[1] * voxels.shape[2]
+    b, z, y, x = voxels.index.t().to(key_type(cells)).contiguous().unbind()
+    key = cell_key((b, z, y, x), voxels.shape)
+    if len(key) and not bool((key[1:] > key[:-1]).all()):
+        raise ValueError("voxels: index must be sorted by (b, z, y, x) with each cell once; assign_cells gives it so")
+    known = _Sites(voxels.index, (b, z, y, x))
+    voxels.cache["sites"] = known
+    return known
+
+
+def submanifold_rulebook(voxels: Voxels, kernel: Kernel) -> Rulebook:
+    """Pairs of a stride 1 convolution whose outputs are the input cells; the centre, an identity, is left out."""
+    sites = _sites(voxels)
+    key = ("submanifold", kernel)
+    if key not in voxels.cache:
+        voxels.cache[key] = _make_submanifold(sites, voxels, kernel)
+    book: Rulebook = voxels.cache[key]
+    return book
+
+
+def _make_submanifold(sites: _Sites, voxels: Voxels, kernel: Kernel) -> Rulebook:
+    margin = tuple(k // 2 * d for k, d in zip(kernel.size, kernel.dilation, strict=True))
+    depth, height, width = (n + 2 * m for n, m in zip(voxels.shape, margin, strict=True))
+    cells = voxels.batch_size * depth * height * width
+    b, z, y, x = (column.to(key_type(cells)) for column in sites.columns)
+    keys = cell_key((b, z + margin[0], y + margin[1], x + margin[2]), (depth, height, width))
+    shifts = [
+        (dz * height + dy) * width + dx
+        for dz, dy, dx in product(*(range(-m, m + 1, d) for m, d in zip(margin, kernel.dilation, strict=True)))
+    ]
+    half = range(kernel.volume // 2 + 1, kernel.volume)
+    rows, neighbours, counts = _find(keys, [shifts[e] for e in half], cells)
+    elements = (*half, *(kernel.volume - 1 - e for e in half))
+    return Rulebook(
+        torch.cat([neighbours, rows]), torch.cat([rows, neighbours]), elements, counts * 2, len(keys), len(keys),
+        True, kernel.volume,
+    )  # fmt: skip
+
+
+def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """All (row, neighbour) with keys[neighbour] == keys[row] + shift, grouped by shift, and the groups' sizes."""
+    if not len(keys) or not shifts:
+        none = torch.zeros(0, dtype=torch.int32, device=keys.device)
+        return none, none, (0,) * len(shifts)
+    table_fits = cells <= _TABLE_CELLS
+    neighbour = _find_in_table(keys, shifts, cells) if table_fits else _find_by_search(keys, shifts)
+    hit = (neighbour >= 0).view(len(shifts), -1)
+    flat = hit.view(-1).nonzero().squeeze(1)
+    counts = tuple(hit.sum(1).tolist())
+    rows = (flat % len(keys)).int()
+    return rows, neighbour.view(-1).index_select(0, flat), counts
+
+
+def _find_in_table(keys: Tensor, shifts: Sequence[int], cells: int) -> Tensor:
+    """Row of keys + shift or -1, (shifts, N) int32, by a dense table that is cleaned after use."""
+    table, places = _table(cells, keys.device), keys.long()
+    table.index_copy_(0, places, torch.arange(len(keys), dtype=torch.int32, device=keys.device))
+    wanted = keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]
+    found = table.index_select(0, wanted.view(-1))
+    table.index_fill_(0, places, -1)
+    return found.view(len(shifts), -1)
+
+
+def _table(cells: int, device: torch.device) -> Tensor:
+    """This thread's table of at least so many -1."""
+    tables: dict[torch.device, Tensor] = _local.__dict__.setdefault("tables", {})
+    if device not in tables or len(tables[device]) < cells:
+        tables[device] = torch.full((cells,), -1, dtype=torch.int32, device=device)
+    return tables[device]
+
+
+def _find_by_search(keys: Tensor, shifts: Sequence[int]) -> Tensor:
+    """Row of keys + shift or -1, (shifts, N) int32: one binary search per run of consecutive shifts.
+
+    The next shift of a run lies at the same place of the sorted keys or, after a hit, at the next.
+    """
+    padded = F.pad(keys, (0, len(shifts) + 1), value=torch.iinfo(keys.dtype).max)
+    found = torch.empty(len(shifts), len(keys), dtype=torch.int32, device=keys.device)
+    place = wanted = keys
+    for number, shift in enumerate(shifts):
+        wanted = keys + shift
+        if number == 0 or shift != shifts[number - 1] + 1:
+            place = torch.searchsorted(keys, wanted, out_int32=True)
+        hit = padded.index_select(0, place) == wanted
+        found[number] = torch.where(hit, place, -1)
+        place = place + hit
+    return found
+
+
+@dataclass
+class StridedRulebook:
+    """The rulebook of a strided convolution and the cells that it makes."""
+
+    book: Rulebook
+    index: Tensor  # (M, 4) int64 output cells, canonical
+    shape: Triple
+    cache: dict[object, object] = field(default_factory=dict, repr=False)  # rulebooks of the output cells
+
+
+def strided_rulebook(voxels: Voxels, kernel: Kernel) -> StridedRulebook:
+    """Pairs of a convolution whose outputs are all cells that a kernel placed there sees an input from."""
+    sites = _sites(voxels)
+    key = ("strided", kernel)
+    if key not in voxels.cache:
+        voxels.cache[key] = _make_strided(sites, voxels, kernel)
+    strided: StridedRulebook = voxels.cache[key]
+    return strided
+
+
+def _axis_pairs(
+    coordinate: Tensor, size: int, stride: int, padding: int, dilation: int, outputs: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Output coordinate, kernel element and validity, each (A, N), of all pairs along one axis."""
+    padded = coordinate + padding
+    if dilation == 1:  # element = padded mod stride + a * stride
+        first = torch.div(padded, stride, rounding_mode="floor")
+        step = torch.arange(-(-size // stride), dtype=padded.dtype, device=padded.device)[:, None]
+        output, element = first - step, (padded - first * stride) + step * stride
+        return output, element, (element < size) & (output >= 0) & (output < outputs)
+    element = torch.arange(size, dtype=padded.dtype, device=padded.device)[:, None].expand(-1, len(padded))
+    reached = padded - element * dilation
+    output = torch.div(reached, stride, rounding_mode="floor")
+    return output, element, (output * stride == reached) & (output >= 0) & (output < outputs)
+
+
+def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRulebook:
+    shape = kernel.output_shape(voxels.shape)
+    cells = voxels.batch_size * shape[0] * shape[1] * shape[2]
+    b, *coordinates = (column.to(key_type(cells)) for column in sites.columns)
+    axes = zip(coordinates, kernel.size, kernel.stride, kernel.padding, kernel.dilation, shape, strict=True)
+    (oz, kz, vz), (oy, ky, vy), (ox, kx, vx) = (_axis_pairs(*axis) for axis in axes)
+    plane = (b * shape[0] + oz)[:, None] * shape[1] + oy
+    key = plane[:, :, None] * shape[2] + ox
+    element = (kz[:, None] * kernel.size[1] + ky)[:, :, None] * kernel.size[2] + kx
+    valid = (vz[:, None] & vy)[:, :, None] & vx
+    flat = valid.view(-1).nonzero().squeeze(1)
+    element, by_element = torch.sort(element.view(-1).index_select(0, flat).to(_element_type(kernel)), stable=True)
+    flat = flat.index_select(0, by_element)
+    counts = tuple(torch.bincount(element, minlength=kernel.volume).tolist())
+    key, order = torch.sort(key.view(-1).index_select(0, flat), stable=True)
+    unique, pairs = torch.unique_consecutive(key, return_counts=True)
+    outputs = torch.empty(len(order), dtype=torch.int32, device=key.device)
+    rows = torch.arange(len(unique), dtype=torch.int32, device=key.device)
+    outputs[order] = torch.repeat_interleave(rows, pairs, output_size=len(order))
+    inputs = (flat % max(len(b), 1)).int()
+    book = Rulebook(
+        inputs, outputs, tuple(range(kernel.volume)), counts, len(b), len(unique), False, kernel.volume,
+        order.int(), row_starts(pairs).int(),
+    )  # fmt: skip
+    return StridedRulebook(book, cell_index(unique, shape), shape)
+
+
+def _element_type(kernel: Kernel) -> torch.dtype:
+    return torch.uint8 if kernel.volume < 256 else torch.int32

@@ -1,0 +1,351 @@
+"""Sparse 3D convolution in plain torch, for CPU and GPU.
+
+Submanifold convolution after Graham et al., "3D Semantic Segmentation with Submanifold Sparse
+Convolutional Networks" (CVPR 2018), section 3. The compute is gather, one matrix product per kernel
+element, and a sum by output row: the gathered rows of all elements lie in one scratch buffer that is
+kept between calls, and the sum is an `embedding_bag`, which needs no atomic addition. Each output row adds
+its terms in a fixed order, so results do not depend on the number of threads.
+
+Weights are (kernel volume, C_in, C_out), elements in z, y, x order: the dense `conv3d` weight is
+`weight.view(kz, ky, kx, C_in, C_out).permute(4, 3, 0, 1, 2)`.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from typing import Any, cast
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F
+
+from lidarfw.errors import LidarfwError
+from lidarfw.ops.rulebook import Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
+from lidarfw.types import Grid, Voxels
+
+_local = threading.local()
+
+
+def _scratch(name: str, rows: int, columns: int, like: Tensor) -> Tensor:
+    """An uninitialised (rows, columns) matrix that lives until the next call of the same name.
+
+    On the CPU a fresh large tensor costs more in page faults than the work on it, so one buffer per
+    thread grows to the largest request. CUDA's allocator keeps blocks itself, and per stream.
+    """
+    if like.device.type != "cpu":
+        return like.new_empty(rows, columns)
+    buffers: dict[tuple[str, torch.dtype], Tensor] = _local.__dict__.setdefault("buffers", {})
+    key = (name, like.dtype)
+    if key not in buffers or buffers[key].numel() < rows * columns:
+        buffers.pop(key, None)
+        buffers[key] = torch.empty(rows * columns, dtype=like.dtype)
+    return buffers[key][: rows * columns].view(rows, columns)
+
+
+def _gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
+    return torch.index_select(features, 0, rows, out=_scratch(name, len(rows), features.shape[1], features))
+
+
+def _multiply_sum(gathered: Tensor, weights: list[Tensor], book: Rulebook) -> Tensor:
+    """Sum by output row (M, C_out) of gathered (P, C_in) times the weight of each pair's element."""
+    products = _scratch("products", len(book), weights[0].shape[1], gathered)
+    groups = zip(
+        gathered.split_with_sizes(book.counts), products.split_with_sizes(book.counts), book.elements, strict=True
+    )
+    for rows, product, element in groups:
+        if len(rows):
+            torch.mm(rows, weights[element], out=product)
+    order, starts = book.by_output()
+    return F.embedding_bag(order, products, starts, mode="sum", include_last_offset=True)
+
+
+def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
+    if len(book):
+        output = _multiply_sum(_gather(features, book.inputs, "rows"), list(weight.unbind()), book)
+    else:
+        output = features.new_zeros(book.num_outputs, weight.shape[2])
+    if book.symmetric:
+        output.addmm_(features, weight[book.volume // 2])
+    return output
+
+
+class _Convolution(torch.autograd.Function):
+    """Saves features and weight only; gathered rows are gathered again for the gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
+        ctx.save_for_backward(features, weight)
+        ctx.book = book
+        with torch.autocast(features.device.type, enabled=False):
+            return _convolve(features, weight, book)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        features, weight = ctx.saved_tensors
+        need_features, need_weight, _ = ctx.needs_input_grad
+        book, gradient = ctx.book.transposed(), gradient.contiguous()
+        with torch.autocast(features.device.type, enabled=False):
+            rows = _gather(gradient, book.inputs, "rows")
+            d_weight = _weight_gradient(features, weight, gradient, rows, book) if need_weight else None
+            d_features = _feature_gradient(weight, gradient, rows, book) if need_features else None
+        return d_features, d_weight, None
+
+
+def _weight_gradient(features: Tensor, weight: Tensor, gradient: Tensor, rows: Tensor, book: Rulebook) -> Tensor:
+    inputs = _gather(features, book.outputs, "products")
+    result = torch.zeros_like(weight)
+    groups = (inputs.split_with_sizes(book.counts), rows.split_with_sizes(book.counts), book.elements)
+    for left, right, element in zip(*groups, strict=True):
+        torch.mm(left.t(), right, out=result[element])
+    if book.symmetric:
+        torch.mm(features.t(), gradient, out=result[book.volume // 2])
+    return result
+
+
+def _feature_gradient(weight: Tensor, gradient: Tensor, rows: Tensor, book: Rulebook) -> Tensor:
+    flipped = weight.transpose(1, 2).contiguous()
+    if len(book):
+        result = _multiply_sum(rows, list(flipped.unbind()), book)
+    else:
+        result = gradient.new_zeros(book.num_outputs, weight.shape[1])
+    return result.addmm_(gradient, flipped[book.volume // 2]) if book.symmetric else result
+
+
+def _triple(value: int | tuple[int, int, int]) -> Triple:
+    return (value, value, value) if isinstance(value, int) else (value[0], value[1], value[2])
+
+
+def _compute_types(features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Features and weight in the type to compute in.
+
+    Under autocast that is its type on a GPU, and float32 on a CPU, where 16 bit products are slower.
+    """
+    kind = features.device.type
+    if torch.is_autocast_enabled(kind):
+        target = torch.float32 if kind == "cpu" else torch.get_autocast_dtype(kind)
+        return features.to(target), weight.to(target)
+    return features, weight
+
+
+def _refuse_export() -> None:
+    if torch.compiler.is_compiling():
+        raise LidarfwError(
+            "sparse convolution cannot be exported or compiled: the number of its pairs depends on the scan.\n"
+            "  Export the dense part behind it (neck and heads, which take a BEV), and run the sparse backbone eagerly."
+        )
+
+
+class _SparseConvolution(nn.Module):
+    """Weights and geometry that all sparse convolutions share."""
+
+    def __init__(self, in_channels: int, out_channels: int, kernel: Kernel, bias: bool) -> None:
+        super().__init__()
+        self.in_channels, self.out_channels, self.kernel = in_channels, out_channels, kernel
+        self.weight = nn.Parameter(torch.empty(kernel.volume, in_channels, out_channels))
+        self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Uniform in +-1/sqrt(fan in), as torch's dense convolutions."""
+        bound = 1 / math.sqrt(self.kernel.volume * self.in_channels)
+        for parameter in self.parameters():
+            nn.init.uniform_(parameter, -bound, bound)
+
+    def extra_repr(self) -> str:
+        kernel = self.kernel
+        text = f"{self.in_channels}, {self.out_channels}, kernel_size={kernel.size}"
+        for name, value in (("stride", kernel.stride), ("padding", kernel.padding), ("dilation", kernel.dilation)):
+            text += f", {name}={value}" if value not in ((1, 1, 1), (0, 0, 0)) else ""
+        return text + f", bias={self.bias is not None}"
+
+    def _apply_rulebook(self, features: Tensor, book: Rulebook) -> Tensor:
+        if features.shape[1] != self.in_channels:
+            raise ValueError(
+                f"{type(self).__name__}: voxels have {features.shape[1]} channels, the layer takes {self.in_channels}"
+            )
+        features, weight = _compute_types(features, self.weight)
+        output = cast(Tensor, _Convolution.apply(features.contiguous(), weight, book))  # type: ignore[no-untyped-call]
+        return output if self.bias is None else output + self.bias.to(output.dtype)
+
+
+class SubmanifoldConv3d(_SparseConvolution):
+    """Convolution whose output cells are its input cells; zero where no input lies.
+
+    `kernel_size` and `dilation` are numbers or (z, y, x); the kernel must be odd.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int | tuple[int, int, int] = 3,
+        dilation: int | tuple[int, int, int] = 1,
+        bias: bool = False,
+    ) -> None:
+        size, dilation = _triple(kernel_size), _triple(dilation)
+        if not all(k % 2 for k in size):
+            raise ValueError(f"SubmanifoldConv3d: kernel_size must be odd to have a centre, got {size}")
+        padding = (size[0] // 2 * dilation[0], size[1] // 2 * dilation[1], size[2] // 2 * dilation[2])
+        super().__init__(in_channels, out_channels, Kernel(size, (1, 1, 1), padding, dilation), bias)
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        _refuse_export()
+        return voxels.with_features(self._apply_rulebook(voxels.features, submanifold_rulebook(voxels, self.kernel)))
+
+
+class SparseConv3d(_SparseConvolution):
+    """Convolution with a stride: an output cell exists where its kernel sees at least one input cell.
+
+    The output shape is floor((n + 2 p - d (k - 1) - 1) / s) + 1 along each axis.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int | tuple[int, int, int],
+        stride: int | tuple[int, int, int] = 1,
+        padding: int | tuple[int, int, int] = 0,
+        dilation: int | tuple[int, int, int] = 1,
+        bias: bool = False,
+    ) -> None:
+        kernel = Kernel(_triple(kernel_size), _triple(stride), _triple(padding), _triple(dilation))
+        super().__init__(in_channels, out_channels, kernel, bias)
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        _refuse_export()
+        book = strided_rulebook(voxels, self.kernel).book
+        return strided_voxels(voxels, self.kernel, self._apply_rulebook(voxels.features, book))
+
+
+def strided_voxels(voxels: Voxels, kernel: Kernel, features: Tensor) -> Voxels:
+    """The voxels that a strided convolution or pooling of `voxels` makes, with their features."""
+    made = strided_rulebook(voxels, kernel)
+    (a, b, c), (d, e, f) = voxels.strides, kernel.stride
+    strides = (a * d, b * e, c * f)
+    return Voxels(features, made.index, voxels.grid, made.shape, strides, voxels.batch_size, made.cache)
+
+
+class SparseInverseConv3d(_SparseConvolution):
+    """The transpose of a strided convolution: from its output cells back to its input cells.
+
+    Give it the geometry of the `SparseConv3d` (or pooling) to undo; forward takes the coarse voxels and
+    the fine ones that went into that layer.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int | tuple[int, int, int],
+        stride: int | tuple[int, int, int] = 1,
+        padding: int | tuple[int, int, int] = 0,
+        dilation: int | tuple[int, int, int] = 1,
+        bias: bool = False,
+    ) -> None:
+        kernel = Kernel(_triple(kernel_size), _triple(stride), _triple(padding), _triple(dilation))
+        super().__init__(in_channels, out_channels, kernel, bias)
+
+    def forward(self, voxels: Voxels, fine: Voxels) -> Voxels:
+        """Features on the cells of `fine`.
+
+        Raises:
+            ValueError: `voxels` are not the output cells of a layer of this geometry on `fine`.
+        """
+        _refuse_export()
+        made = strided_rulebook(fine, self.kernel)
+        if made.index is not voxels.index and not torch.equal(made.index, voxels.index):
+            raise ValueError(
+                f"SparseInverseConv3d: the {len(voxels)} coarse voxels are not what {self.kernel} makes of the "
+                f"{len(fine)} fine ones ({len(made.index)} cells); give it the geometry of the layer to undo"
+            )
+        return fine.with_features(self._apply_rulebook(voxels.features, made.book.transposed()))
+
+
+class _SparsePool3d(nn.Module):
+    def __init__(
+        self,
+        kernel_size: int | tuple[int, int, int],
+        stride: int | tuple[int, int, int] | None = None,
+        padding: int | tuple[int, int, int] = 0,
+    ) -> None:
+        super().__init__()
+        size = _triple(kernel_size)
+        self.kernel = Kernel(size, size if stride is None else _triple(stride), _triple(padding))
+
+    def extra_repr(self) -> str:
+        return f"kernel_size={self.kernel.size}, stride={self.kernel.stride}, padding={self.kernel.padding}"
+
+
+class SparseMaxPool3d(_SparsePool3d):
+    """Maximum over the cells that are there. `stride` defaults to the kernel size."""
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        book = strided_rulebook(voxels, self.kernel).book
+        rows = voxels.features.index_select(0, book.inputs)
+        target = book.outputs.long()[:, None].expand_as(rows)
+        lowest = rows.new_full((book.num_outputs, rows.shape[1]), -torch.inf)
+        return strided_voxels(voxels, self.kernel, lowest.scatter_reduce(0, target, rows, "amax"))
+
+
+class SparseAvgPool3d(_SparsePool3d):
+    """Mean over the cells that are there. `stride` defaults to the kernel size."""
+
+    def forward(self, voxels: Voxels) -> Voxels:
+        book = strided_rulebook(voxels, self.kernel).book
+        summed = cast(Tensor, _PairSum.apply(voxels.features, book))  # type: ignore[no-untyped-call]
+        starts = book.by_output()[1]
+        return strided_voxels(voxels, self.kernel, summed / starts.diff()[:, None].to(summed.dtype))
+
+
+class _PairSum(torch.autograd.Function):
+    """Sum of the inputs of every output, without weights."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, book: Rulebook) -> Tensor:
+        ctx.book = book
+        return _pair_sum(features, book)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return _pair_sum(gradient.contiguous(), ctx.book.transposed()), None
+
+
+def _pair_sum(features: Tensor, book: Rulebook) -> Tensor:
+    if not len(book):
+        return features.new_zeros(book.num_outputs, features.shape[1])
+    order, starts = book.by_output()
+    rows = book.inputs.index_select(0, order)
+    return F.embedding_bag(rows, features, starts, mode="sum", include_last_offset=True)
+
+
+class SparseSequential(nn.Sequential):
+    """A sequence of sparse layers (Voxels -> Voxels) and of plain modules, which see the features (N, C)."""
+
+    def forward(self, voxels: Voxels) -> Voxels:  # type: ignore[override]
+        for module in self:
+            if isinstance(module, (_SparseConvolution, _SparsePool3d, SparseSequential)):
+                voxels = module(voxels)
+            else:
+                voxels = voxels.with_features(module(voxels.features))
+        return voxels
+
+
+def to_dense(voxels: Voxels) -> Tensor:
+    """(B, C, D, H, W) map with zeros where no voxel lies."""
+    depth, height, width = voxels.shape
+    b, z, y, x = voxels.index.unbind(1)
+    dense = voxels.features.new_zeros(voxels.batch_size, depth, height, width, voxels.features.shape[1])
+    return dense.index_put((b, z, y, x), voxels.features).permute(0, 4, 1, 2, 3).contiguous()
+
+
+def from_dense(dense: Tensor, grid: Grid, strides: tuple[int, int, int] = (1, 1, 1)) -> Voxels:
+    """Voxels where any channel of dense (B, C, D, H, W) differs from zero."""
+    index = (dense.detach() != 0).any(1).nonzero()
+    b, z, y, x = index.unbind(1)
+    batch, _, depth, height, width = dense.shape
+    return Voxels(dense[b, :, z, y, x], index, grid, (depth, height, width), strides, batch)
