@@ -1,0 +1,5 @@
+"""`python -m lidarfw`."""
+
+from lidarfw.cli import run
+
+run()

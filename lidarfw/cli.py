@@ -1,0 +1,77 @@
+"""The command line: `lidarfw train|eval|predict|list|show|check|new|prepare|bench|completion`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+
+import lidarfw
+from lidarfw.errors import LidarfwError
+
+COMMANDS = {
+    "train": "train a model: components and settings as overrides (head=center optimizer.lr=0.01)",
+    "eval": "measure a checkpoint on a dataset",
+    "predict": "run a checkpoint on scans or images and write results and pictures",
+    "list": "what is installed, by slot",
+    "show": "how components would be wired, and how large the model is",
+    "check": "test a plugin or component against the rules of its interface",
+    "new": "write a plugin distribution to start from",
+    "prepare": "make a dataset ready: indices, databases, generated data",
+    "bench": "time a model's components, or the ops",
+    "completion": "print the shell code that completes names with <TAB>",
+}
+_EXAMPLES = """examples:
+  lidarfw list head
+  lidarfw show backbone=second neck=[height_compression,bev_fpn] head=center
+  lidarfw train experiment=pillars_kitti dataset.kitti.root=/data/kitti
+  lidarfw eval runs/train/.../last.ckpt --json figures.json
+  lidarfw predict runs/train/.../last.ckpt scan.bin -o out
+"""
+
+
+def parser(chosen: str | None = None) -> argparse.ArgumentParser:
+    """The parser of all commands; only the arguments of the `chosen` one are filled in."""
+    top = argparse.ArgumentParser(
+        "lidarfw", description=lidarfw.__doc__, epilog=_EXAMPLES, formatter_class=argparse.RawTextHelpFormatter
+    )
+    top.add_argument("--version", action="version", version=f"lidarfw {lidarfw.__version__}")
+    commands = top.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, text in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        command.add_argument("--debug", action="store_true", help="show the trace of an error")
+        if name == chosen:
+            importlib.import_module(f"lidarfw.commands.{name}").add_arguments(command)
+    return top
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The arguments of one command. What follows `train` is Hydra's, flags included, in its order."""
+    chosen = arguments[0] if arguments else None
+    if chosen == "train" and not {"-h", "--help"} & set(arguments):
+        rest = [argument for argument in arguments[1:] if argument != "--debug"]
+        return argparse.Namespace(command="train", overrides=rest, debug="--debug" in arguments)
+    return parser(chosen).parse_args(arguments)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; the exit code is 0, 1 (checks failed) or 2 (the user can mend it)."""
+    args = parse(list(sys.argv[1:] if argv is None else argv))
+    try:
+        return int(importlib.import_module(f"lidarfw.commands.{args.command}").run(args))
+    except LidarfwError as error:
+        if args.debug or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            traceback.print_exc()
+        print(error, file=sys.stderr)
+        return 2
+    except BrokenPipeError:  # `lidarfw list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def run() -> None:
+    """Entry of the console script."""
+    sys.exit(main())

@@ -1,0 +1,57 @@
+"""`lidarfw train`: check the combination at once, then hand over to Hydra and Lightning."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from lidarfw.errors import LidarfwError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of `lidarfw train`: those of Hydra."""
+    parser.add_argument(
+        "overrides", nargs="*", metavar="OVERRIDE", help="GROUP=NAME, GROUP=[A,B], KEY=VALUE; Hydra's own flags work: -m, --cfg job"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compose, plan (which refuses a wrong combination within a second), then train."""
+    from lidarfw import config
+    from lidarfw.assembly import plan
+
+    if not any(argument.startswith("-") for argument in args.overrides):
+        plan(config.compose(args.overrides))
+    config.register()
+    return _hydra(args.overrides)
+
+
+def _hydra(arguments: list[str]) -> int:
+    import hydra
+    from omegaconf import DictConfig
+
+    argv = sys.argv
+    failed: list[LidarfwError] = []
+
+    def task(cfg: DictConfig) -> Any:
+        # Lightning starts the other processes of a DDP run from sys.argv: give it back first
+        sys.argv = argv
+        from lidarfw.training import train
+
+        try:
+            return train(cfg)
+        except LidarfwError as error:
+            failed.append(error)
+            raise
+
+    sys.argv = [argv[0], *arguments]
+    try:
+        hydra.main(config_path="pkg://lidarfw.conf", config_name="train", version_base="1.3")(task)()
+    except SystemExit:
+        if failed:
+            raise failed[-1] from None
+        raise
+    finally:
+        sys.argv = argv
+    return 0
