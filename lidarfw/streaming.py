@@ -11,7 +11,7 @@ import torch
 from lidarfw.errors import CheckpointError
 from lidarfw.interfaces import Filter
 from lidarfw.plain import from_plain, to_plain
-from lidarfw.types import Batch, Frame, FrameMeta, FrameResult, collate
+from lidarfw.types import Frame, FrameMeta, FrameResult, collate
 
 if TYPE_CHECKING:
     from lidarfw.model import PerceptionModel
@@ -35,35 +35,30 @@ class Stream:
         self._filters: dict[str, Filter] = modules
         self._states: dict[str, Any] = {}
         self._last: FrameMeta | None = None
-        self._waiting: dict[str, Batch] = {}  # data of the frames that are held back, by frame id
 
     @torch.no_grad()
     def step(self, frame: Frame) -> list[FrameResult]:
         """Run the model on the next frame; the frames that are finished now, in order."""
         device = next((p.device for p in self.model.parameters()), torch.device("cpu"))
-        batch = collate([frame]).to(device)
-        return self.advance(self.model.decode(self.model(batch), batch)[0], batch)
+        return self.advance(self.model.predict(collate([frame]).to(device))[0])
 
     @torch.no_grad()
-    def advance(self, result: FrameResult, batch: Batch) -> list[FrameResult]:
-        """Like `step`, for a frame that the model has seen already; `batch` holds that frame alone."""
+    def advance(self, result: FrameResult) -> list[FrameResult]:
+        """Like `step`, for a frame that the model has predicted already."""
         finished = self.flush() if self._ends_run(result.meta) else []
         if self._last is None:
             self._states = {name: part.start() for name, part in self._filters.items()}
         self._last = result.meta
-        self._waiting[result.meta.id] = batch
-        return finished + self._finish(self._run([result], list(self._filters)))
+        return finished + self._run([result], list(self._filters))
 
     @torch.no_grad()
     def flush(self) -> list[FrameResult]:
         """End the run: the frames that were held back, in order. The next frame starts anew."""
-        names = list(self._filters)
-        held: list[FrameResult] = []
-        for position, name in enumerate(names if self._last is not None else []):
-            held += self._run(self._filters[name].flush(self._states[name]), names[position + 1 :])
+        names = list(self._filters) if self._last is not None else []
+        finished: list[FrameResult] = []
+        for position, name in enumerate(names):
+            finished += self._run(self._filters[name].flush(self._states[name]), names[position + 1 :])
         self._states, self._last = {}, None
-        finished = self._finish(held)
-        self._waiting = {}
         return finished
 
     def _ends_run(self, meta: FrameMeta) -> bool:
@@ -78,13 +73,7 @@ class Stream:
         return results
 
     def _step_filter(self, name: str, result: FrameResult) -> list[FrameResult]:
-        arguments = self.model.filter_arguments(name, result, self._waiting[result.meta.id])
-        return self._filters[name].step(self._states[name], result, **arguments)
-
-    def _finish(self, results: list[FrameResult]) -> list[FrameResult]:
-        for result in results:
-            self._waiting.pop(result.meta.id, None)
-        return results
+        return self._filters[name].step(self._states[name], result, **self.model.filter_arguments(name, result))
 
     def _classes(self) -> dict[str, type]:
         """Dataclasses that the filters keep as state or inside it, by component and class name."""
@@ -96,7 +85,7 @@ class Stream:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on from here, in plain types and tensors; a copy."""
-        state = {"filters": list(self._filters), "states": self._states, "last": self._last, "waiting": self._waiting}
+        state = {"filters": list(self._filters), "states": self._states, "last": self._last}
         return {name: to_plain(value, self._classes()) for name, value in state.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -106,10 +95,8 @@ class Stream:
                 f"the saved stream ran filters {state['filters']}, this model has {list(self._filters)}.\n"
                 "  fix: load the model that the stream was saved with"
             )
-        classes = self._classes()
-        self._states = from_plain(state["states"], classes)
+        self._states = from_plain(state["states"], self._classes())
         self._last = from_plain(state["last"])
-        self._waiting = from_plain(state["waiting"])
 
 
 def _dataclasses_in(annotation: Any) -> set[type]:

@@ -79,24 +79,20 @@ class Count(Tracker):
 class Oracle(nn.Module):
     """A model that gives the targets back."""
 
-    def __init__(self, filters: dict[str, Filter], trackers: dict[str, Filter] | None = None) -> None:
+    def __init__(self, filters: dict[str, Filter]) -> None:
         super().__init__()
-        self.filter, self.tracker = nn.ModuleDict(filters), nn.ModuleDict(trackers or {})
+        self.filters = filters
 
-    def forward(self, batch: Batch) -> dict[str, Any]:
-        return {"head.oracle": batch.targets.boxes}
+    def predict(self, batch: Batch) -> list[FrameResult]:
+        predictions = {"head.oracle": batch.targets.boxes, "points": len(batch.inputs["points"])}
+        return [FrameResult(batch.meta[0], predictions, inputs=batch.inputs)]
 
-    def decode(self, outputs: dict[str, Any], batch: Batch) -> list[FrameResult]:
-        predictions = {"head.oracle": outputs["head.oracle"], "points": len(batch.inputs["points"])}
-        return [FrameResult(batch.meta[0], predictions)]
-
-    def filter_arguments(self, component: str, result: FrameResult, batch: Batch) -> dict[str, Any]:
-        assert batch.meta[0].id == result.meta.id
-        return {"points": batch.inputs["points"]} if component.startswith("filter") else {}
+    def filter_arguments(self, component: str, result: FrameResult) -> dict[str, Any]:
+        return {"points": result.inputs["points"]} if component.startswith("filter") else {}
 
 
 def stream(*delays: int, max_gap: float = 1.0) -> Stream:
-    model = Oracle({f"delay{i}": Delay(n) for i, n in enumerate(delays)}, {"count": Count()})
+    model = Oracle({**{f"filter.delay{i}": Delay(n) for i, n in enumerate(delays)}, "tracker.count": Count()})
     return Stream(model, max_gap)  # type: ignore[arg-type]
 
 
@@ -152,7 +148,7 @@ def test_a_gap_in_time_starts_anew(street: list[Frame], shift: float, resets: bo
 
 
 def test_two_streams_of_one_model_do_not_touch_each_other(street: list[Frame]) -> None:
-    model = Oracle({"delay": Delay(1)}, {"count": Count()})
+    model = Oracle({"filter.delay": Delay(1), "tracker.count": Count()})
     a, b, alone = (Stream(model) for _ in range(3))  # type: ignore[arg-type]
     mixed: list[FrameResult] = []
     for frame, other in zip(street, reversed(street), strict=True):
