@@ -37,6 +37,7 @@ class Boxes(Rows):
     box2d: Tensor | None = None  # (M, 4) pixels left, top, right, bottom
     occlusion: Tensor | None = None  # (M,) int64, 0 visible, 1 partly, 2 largely, 3 unknown
     truncation: Tensor | None = None  # (M,) 0..1 share outside the picture
+    alpha: Tensor | None = None  # (M,) observation angle in the picture, radians: heading less bearing
     row: Tensor | None = None  # (M,) int64, place of the object in its label file
 
     @property
