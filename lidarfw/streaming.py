@@ -29,10 +29,7 @@ class Stream:
     def __init__(self, model: PerceptionModel, max_gap: float = 1.0) -> None:
         self.model = model
         self.max_gap = max_gap
-        modules = {
-            f"{slot}.{name}": part for slot in ("filter", "tracker") for name, part in getattr(model, slot).items()
-        }
-        self._filters: dict[str, Filter] = modules
+        self._filters: dict[str, Filter] = model.filters
         self._states: dict[str, Any] = {}
         self._last: FrameMeta | None = None
 
@@ -77,7 +74,7 @@ class Stream:
 
     def _classes(self) -> dict[str, type]:
         """Dataclasses that the filters keep as state or inside it, by component and class name."""
-        found = {}
+        found: dict[str, type] = {}
         for name, part in self._filters.items():
             state = type(part.start())
             found |= {f"{name}:{cls.__qualname__}": cls for cls in _dataclasses_in(state)}
