@@ -159,8 +159,8 @@ def _moved(points: Points, world: scene.Scene, taken: int, now: int) -> Points:
 def _picture(world: scene.Scene, step: int) -> Image:
     """What the camera sees, by the same ray caster: all pixels of a column share their azimuth."""
     fx, fy, cx, cy = CAMERA.intrinsics
-    across = (np.arange(CAMERA.width) + 0.5 - cx) / fx
-    down = (np.arange(CAMERA.height) + 0.5 - cy) / fy
+    across = (np.arange(CAMERA.width) - cx) / fx
+    down = (np.arange(CAMERA.height) - cy) / fy
     slope = -down[None] / np.hypot(1, across)[:, None]
     hits = scene.cast(-np.arctan(across), slope, world.boxes(step), world.kinds, _CAMERA_HEIGHT)
     return Image(_tensor(scene.colours(hits, world.kinds).transpose(2, 1, 0)[None]), (CAMERA,))
@@ -183,30 +183,29 @@ def _boxes(world: scene.Scene, step: int, chosen: scene.Array) -> Boxes:
     tensor = _tensor(world.boxes(step)[chosen])
     boxes = Boxes.from_tensor(tensor, torch.from_numpy(world.label[chosen]))
     velocity = _tensor(world.seen_velocity(step)[chosen])
-    box2d, truncation = _box2d(world.boxes(step)[chosen])
+    box2d, truncation = _box2d(tensor)
     return boxes.replace(
         velocity=velocity,
         moving=(velocity.norm(dim=1) > 0).to(torch.int8),
-        box2d=_tensor(box2d),
-        truncation=_tensor(truncation),
+        box2d=box2d,
+        truncation=truncation,
         occlusion=torch.zeros(len(boxes), dtype=torch.long),
     )
 
 
-def _box2d(boxes: scene.Array) -> tuple[scene.Array, scene.Array]:
+def _box2d(boxes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Upright pixel boxes (M, 4) clipped to the picture, and the share (M,) of each that lies outside."""
-    signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), -1).reshape(8, 3)
-    corners = signs * boxes[:, None, 3:6]
-    cos, sin = np.cos(boxes[:, 6:7]), np.sin(boxes[:, 6:7])
-    ahead = cos * corners[..., 0] - sin * corners[..., 1] + boxes[:, 0:1]
-    left = sin * corners[..., 0] + cos * corners[..., 1] + boxes[:, 1:2]
+    from lidarfw.ops import box_corners
+
+    ahead, left, up = box_corners(boxes).unbind(2)
     fx, fy, cx, cy = CAMERA.intrinsics
-    column = cx - fx * left / ahead.clip(0.1)
-    row = cy - fy * (corners[..., 2] + boxes[:, 2:3] - _CAMERA_HEIGHT) / ahead.clip(0.1)
-    whole = np.stack([column.min(1), row.min(1), column.max(1), row.max(1)], 1)
-    inside = whole.clip(0, [CAMERA.width, CAMERA.height, CAMERA.width, CAMERA.height])
-    areas = [np.prod(box[:, 2:] - box[:, :2], axis=1) for box in (inside, whole)]
-    return inside, 1 - areas[0] / np.maximum(areas[1], 1e-9)
+    column = cx - fx * left / ahead.clamp(min=0.1)
+    row = cy - fy * (up - _CAMERA_HEIGHT) / ahead.clamp(min=0.1)
+    low, high = torch.stack([column, row], 2).aminmax(dim=1)
+    edge = low.new_tensor([CAMERA.width, CAMERA.height]) - 0.5
+    inside = torch.cat([torch.minimum(part.clamp(min=-0.5), edge) for part in (low, high)], 1)
+    seen = (inside[:, 2:] - inside[:, :2]).prod(1)
+    return inside, 1 - seen / (high - low).prod(1)
 
 
 def _point_labels(world: scene.Scene, hits: scene.Array, classes: int) -> PointLabels:
