@@ -1,0 +1,73 @@
+"""Exact nearest-neighbour search over all descriptors of a map."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from lidarfw.errors import ConfigError, DataError
+from lidarfw.interfaces import Retriever
+from lidarfw.retrieval import Index
+from lidarfw.types import Descriptors, Matches, Poses
+
+QUERIES = 1024  # at a time
+
+
+class ExactRetriever(Retriever):
+    """Compare every query with every place of the map by L2 distance, `chunk` places at a time.
+
+    The search runs in float64, since the formula by inner products cancels for near neighbours: a descriptor finds
+    itself, at distance 0, also among near copies. Raises DataError for descriptors that are not finite and
+    ConfigError for a query of another width than the map.
+    """
+
+    def __init__(self, *, chunk: int = 8192) -> None:
+        super().__init__()
+        if chunk < 1:
+            raise ConfigError(f"retriever.exact.chunk must be at least 1, found {chunk}")
+        self.chunk = chunk
+
+    def build(self, descriptors: Descriptors, poses: Poses) -> Index:
+        """The index of a map; its times are not known (NaN), set them by `index.replace(time=...)`."""
+        vector = _finite(descriptors, "map")
+        if len(vector) != poses.batch_size:
+            raise DataError(
+                f"the map has {len(vector)} descriptors but {poses.batch_size} poses; each place needs both"
+            )
+        time = torch.full((len(vector),), torch.nan, dtype=torch.float64, device=vector.device)
+        return Index(vector, poses.matrix, time, descriptors.modality)
+
+    @torch.no_grad()
+    def query(self, index: Index, descriptors: Descriptors, k: int) -> Matches:
+        """The k nearest places of each descriptor; where the map has fewer, index -1 and distance inf fill up."""
+        vector = _finite(descriptors, "query")
+        if k < 1:
+            raise ConfigError(f"a query needs k of at least 1, found {k}")
+        if len(index) and vector.shape[1] != index.vector.shape[1]:
+            raise ConfigError(
+                f"the map has descriptors of {index.vector.shape[1]} numbers, the query has {vector.shape[1]}.\n"
+                "  fix: query with the model that built the map"
+            )
+        blocks = [self._search(index, vector[i : i + QUERIES], k) for i in range(0, max(len(vector), 1), QUERIES)]
+        return Matches(torch.cat([rows for rows, _ in blocks]), torch.cat([distance for _, distance in blocks]))
+
+    def _search(self, index: Index, vector: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        """Row and distance (Q, k) of the nearest places of a block of queries (Q, D)."""
+        best = torch.full((len(vector), k), torch.inf, dtype=torch.float64, device=vector.device)
+        rows = torch.full(best.shape, -1, dtype=torch.long, device=vector.device)
+        for start in range(0, len(index), self.chunk):
+            part = index.vector[start : start + self.chunk].double()
+            distance = torch.cdist(vector.double(), part, compute_mode="use_mm_for_euclid_dist")
+            number = torch.arange(start, start + len(part), device=rows.device).expand(len(vector), -1)
+            best, order = torch.cat([best, distance], 1).topk(k, dim=1, largest=False)
+            rows = torch.cat([rows, number], 1).gather(1, order)
+        exact = (vector[:, None] - index.vector[rows]).norm(dim=2) if len(index) else best.float()
+        exact, order = torch.where(rows >= 0, exact, torch.inf).sort(stable=True, dim=1)
+        return rows.gather(1, order), exact
+
+
+def _finite(descriptors: Descriptors, what: str) -> Tensor:
+    bad = (~descriptors.vector.isfinite().all(1)).nonzero()[:, 0].tolist()
+    if bad:
+        raise DataError(f"{len(bad)} of the {what}'s descriptors hold NaN or inf, the first in row {bad[0]}")
+    return descriptors.vector.detach()
