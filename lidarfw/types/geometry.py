@@ -279,12 +279,11 @@ def _one_to_one(coefficients: tuple[float, ...], end: float = math.inf) -> float
     return min([end, *(math.sqrt(square) for square in squares)])
 
 
-def _invert_radial(value: Tensor, coefficients: tuple[float, ...], end: float) -> Tensor:
-    """r >= 0 with r (1 + k1 r^2 + ...) = `value`, NaN where there is none: Newton steps kept in a bracket."""
+def _invert_radial(value: Tensor, coefficients: tuple[float, ...], end: float = math.inf) -> Tensor:
+    """r >= 0 with r (1 + k1 r^2 + ...) = `value`, at most where that stops to grow: Newton steps kept in a bracket."""
     slopes = _derivative_coefficients(coefficients)
     low, high = torch.zeros_like(value), torch.full_like(value, min(_one_to_one(coefficients, end), 1e6))
-    top = high * _polynomial(high**2, coefficients)
-    goal = torch.minimum(value, top)
+    goal = torch.minimum(value, high * _polynomial(high**2, coefficients))
     radius = torch.minimum(value, high)
     for _ in range(60):
         error = radius * _polynomial(radius**2, coefficients) - goal
@@ -293,7 +292,7 @@ def _invert_radial(value: Tensor, coefficients: tuple[float, ...], end: float) -
         low, high = torch.where(error < 0, radius, low), torch.where(error > 0, radius, high)
         step = radius - error / _polynomial(radius**2, slopes)
         radius = torch.where((step > low) & (step < high), step, (low + high) / 2)
-    return torch.where(value <= top, radius, torch.nan)
+    return radius
 
 
 def _distort(plane: Tensor, coefficients: tuple[float, ...]) -> Tensor:
@@ -311,12 +310,23 @@ def _undistort(goal: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     """Inverse of `_distort`, NaN where there is none: the radial inverse, then Newton steps in two dimensions."""
     if not coefficients:
         return goal
+    radial = _radial_part(coefficients)
     radius = goal.norm(dim=1, keepdim=True)
-    plane = goal * _invert_radial(radius, _radial_part(coefficients), math.inf) / radius.clamp(min=1e-30)
-    for _ in range(6 if any(coefficients[2:4]) else 0):  # quadratic from a start that is off by p1, p2
-        plane = plane - _newton_step(plane, _distort(plane, coefficients) - goal, coefficients)
-    error = (_distort(plane, coefficients) - goal).norm(dim=1, keepdim=True)
-    return torch.where(error < 64 * torch.finfo(goal.dtype).eps * (1 + radius), plane, torch.nan)
+    start = _invert_radial(radius, radial).clamp(max=0.99 * _one_to_one(radial))  # at the limit there is no slope
+    plane = goal * start / radius.clamp(min=1e-30)
+    tolerance = 16 * torch.finfo(goal.dtype).eps * (1 + radius[:, 0])
+    active = torch.arange(len(goal), device=goal.device)
+    for _ in range(40):  # one or two on most of the picture; halving near the limit, where the slope vanishes
+        error = _distort(plane[active], coefficients) - goal[active]
+        wrong = error.norm(dim=1) > tolerance[active]
+        active = active[wrong]
+        if not len(active):
+            break
+        plane[active] = plane[active] - _newton_step(plane[active], error[wrong], coefficients)
+    found = ((_distort(plane, coefficients) - goal).norm(dim=1) <= tolerance) & (
+        plane.norm(dim=1) < _one_to_one(radial)
+    )
+    return torch.where(found[:, None], plane, torch.nan)
 
 
 def _newton_step(plane: Tensor, error: Tensor, coefficients: tuple[float, ...]) -> Tensor:
@@ -362,6 +372,9 @@ def _fisheye_plane(xyz: Tensor, coefficients: tuple[float, ...]) -> tuple[Tensor
 def _fisheye_rays(plane: Tensor, coefficients: tuple[float, ...]) -> Tensor:
     radius = plane.norm(dim=1, keepdim=True)
     angle = _invert_radial(radius, coefficients, math.pi)
+    limit = _one_to_one(coefficients, math.pi)
+    edge = limit * _polynomial(radius.new_tensor(limit**2), coefficients)
+    angle = torch.where(radius <= edge, angle, torch.nan)
     return torch.cat([plane / radius.clamp(min=1e-30) * torch.sin(angle), torch.cos(angle)], 1)
 
 
