@@ -22,7 +22,7 @@ from lidarfw import __version__, declaration, registry
 from lidarfw.config import LOSS_RESERVED, RESERVED, node_class, to_plain
 from lidarfw.declaration import REQUIRED, Declaration, Parameter, kind_name
 from lidarfw.errors import AssemblyError, ConfigError
-from lidarfw.interfaces import SLOTS, Dataset, Transform
+from lidarfw.interfaces import Dataset, Transform
 from lidarfw.types import Boxes, DataSpec, Descriptors, PointLabels, Poses, SceneCoords, Spec, Tracks
 
 if TYPE_CHECKING:
@@ -108,9 +108,13 @@ class Plan:
 # --- data ----------------------------------------------------------------------------------------------------------
 
 
+def _plain(config: Mapping[str, Any] | DictConfig) -> dict[str, Any]:
+    return to_plain(config) if isinstance(config, DictConfig) else dict(config.items())
+
+
 def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:
     """The dataset of a config for one split; nothing is read from disk yet."""
-    plain = to_plain(config) if isinstance(config, DictConfig) else dict(config)
+    plain = _plain(config)
     nodes = list(_nodes(plain, "dataset", []))
     if len(nodes) != 1:
         raise ConfigError(f"a run has one dataset, found {[n for n, _ in nodes] or 'none'}.\n  fix: dataset=NAME")
@@ -121,7 +125,7 @@ def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:
 
 def make_transforms(config: Mapping[str, Any] | DictConfig, training: bool) -> list[Transform]:
     """The transforms of a config in order; without augmentations unless `training`."""
-    plain = to_plain(config) if isinstance(config, DictConfig) else dict(config)
+    plain = _plain(config)
     made: list[Transform] = [_create("transform", name, node) for name, node in _nodes(plain, "transform", [])]
     return [t for t in made if training or not t.train_only]
 
@@ -149,7 +153,7 @@ def plan(config: Mapping[str, Any] | DictConfig, data: DataSpec | None = None) -
 
     Raises AssemblyError, ConfigError, RegistryError, each with a fix.
     """
-    plain = to_plain(config) if isinstance(config, DictConfig) else dict(config)
+    plain = _plain(config)
     warnings: list[str] = []
     spec = _data_spec(plain) if data is None else data
     planner = _Planner(spec, plain, warnings)
@@ -161,8 +165,11 @@ def plan(config: Mapping[str, Any] | DictConfig, data: DataSpec | None = None) -
 
 
 def _nodes(config: Mapping[str, Any], slot: str, warnings: list[str]) -> Iterator[tuple[str, dict[str, Any]]]:
-    selected = {name: node for name, node in (config.get(slot) or {}).items() if "type" in (node or {})}
-    for name, node in (config.get(slot) or {}).items():
+    nodes = config.get(slot) or {}
+    if not (isinstance(nodes, dict) and all(isinstance(node, dict) for node in nodes.values())):
+        raise ConfigError(f"{slot} must hold components by name, found {nodes!r}.\n  fix: {slot}=NAME or {slot}=[A,B]")
+    selected = {name: node for name, node in nodes.items() if "type" in node}
+    for name, node in nodes.items():
         if name in selected:
             yield name, node
         elif name in registry.names(slot):
@@ -248,7 +255,9 @@ class _Planner:
             self.config[slot] = added
 
     def _warn_unlearned(self, heads: list[Step]) -> None:
-        learned = {ref.producer for step in self.steps if step.slot == "loss" for refs in step.takes.values() for ref in refs}
+        learned = {
+            ref.producer for step in self.steps if step.slot == "loss" for refs in step.takes.values() for ref in refs
+        }
         for head in heads:
             if head.id not in learned and any(step.slot == "loss" for step in self.steps):
                 self.warnings.append(f"{head.id} has no loss and will not learn")
@@ -313,7 +322,9 @@ class _Planner:
                 f"{self._available()}\n  fix: {_heads_giving(p.kind)} or leave it out: {step.slot}=[{without}]"
             )
         names = " or ".join(h.id for h in found)
-        raise AssemblyError(f"{step.id} could take {p.name} from {names}; write {step.id}.inputs: {{{p.name}: {found[0].id}}}")
+        raise AssemblyError(
+            f"{step.id} could take {p.name} from {names}; write {step.id}.inputs: {{{p.name}: {found[0].id}}}"
+        )
 
     def _tap(self, step: Step, p: Parameter, chosen: Any) -> Ref:
         predicts = p.tap
@@ -337,7 +348,9 @@ class _Planner:
         for name in chosen:
             if name not in names:
                 near = registry.did_you_mean(name, names)
-                raise AssemblyError(f"{step.id}.inputs has {name!r}, but it takes {', '.join(names) or 'nothing'}.{near}")
+                raise AssemblyError(
+                    f"{step.id}.inputs has {name!r}, but it takes {', '.join(names) or 'nothing'}.{near}"
+                )
 
     def _check_data(self, step: Step) -> None:
         for p in step.parameters:
@@ -354,10 +367,15 @@ class _Planner:
         names = ", ".join(self.config.get("dataset") or {"the data": 0})
         has = ", ".join(sorted(kind_name(k) for k in self.data.targets)) or "no labels"
         fitting = ", ".join(_datasets_with(label)) or "none is installed"
-        return f"{step.id} needs {kind_name(label)} labels, dataset {names!r} has {has}.\n  datasets with them: {fitting}"
+        return (
+            f"{step.id} needs {kind_name(label)} labels, dataset {names!r} has {has}.\n  datasets with them: {fitting}"
+        )
 
     def _available(self) -> str:
-        rows = [f"    {ref.producer:<26} {kind_name(ref.kind)}{' (several strides)' if ref.several else ''}" for ref in self.visible]
+        rows = [
+            f"    {ref.producer:<26} {kind_name(ref.kind)}{' (several strides)' if ref.several else ''}"
+            for ref in self.visible
+        ]
         return "  available here:\n" + ("\n".join(rows) or "    nothing")
 
     def _nothing_provides(self, step: Step, p: Parameter) -> str:
@@ -378,7 +396,8 @@ class _Planner:
         here = {ref.kind for ref in self.visible}
         if step.slot == "head" and p.kind in _LABEL_OF:
             heads = [d.entry.name for d in declaration.all_declarations("head") if any(k is p.kind for k, _ in d.gives)]
-            return f"\n  fix: put a head before it that predicts {kind_name(p.kind)}: {', '.join(heads) or 'none installed'}"
+            names = ", ".join(heads) or "none installed"
+            return f"\n  fix: put a head before it that predicts {kind_name(p.kind)}: {names}"
         chains = list(_neck_chains(here, p.kind)) if step.slot in ("neck", "head") else []
         return f"\n  fix: add one of: {', '.join(chains)}" if chains else ""
 
@@ -473,7 +492,7 @@ def _spec_of(step: Step, p: Parameter, specs: dict[tuple[str, Any, str], Any]) -
         return None
     if p.form == "dict":
         return {r.producer.partition(".")[2]: spec for r, spec in zip(step.takes[p.name], found, strict=True)}
-    levels = [s for spec in found for s in (spec if isinstance(spec, list) else [spec])]
+    levels: list[Spec] = [s for spec in found for s in (spec if isinstance(spec, list) else [spec])]  # type: ignore[misc]
     if p.form == "list":
         return levels
     return _one_level(step, p, levels)
@@ -499,7 +518,9 @@ def _publish_specs(step: Step, module: Any, specs: dict[tuple[str, Any, str], An
     for part in parts:
         first = part[0] if isinstance(part, list) and part else part
         if not isinstance(first, Spec):
-            raise AssemblyError(f"{step.id}: self.provides must be a Spec (or a list, or a tuple of them), found {part!r}")
+            raise AssemblyError(
+                f"{step.id}: self.provides must be a Spec (or a list, or a tuple of them), found {part!r}"
+            )
         if first.kind not in {kind for kind, _ in step.declared.gives}:
             raise AssemblyError(f"{step.id}: self.provides says {first}, its annotations say otherwise")
         specs[step.id, first.kind, "value"] = part

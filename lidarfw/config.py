@@ -13,6 +13,7 @@ import inspect
 import re
 import typing
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, cast, get_args, get_origin
 
 from hydra import compose as hydra_compose
@@ -100,7 +101,9 @@ def node_class(slot: str, name: str) -> type:
         fields += [("weight", float, 1.0), ("ramp", float, 0.0)]
     for option, (annotation, default) in ((n, (o.annotation, o.default)) for n, o in declared.options.items()):
         fields.append((option, supported(annotation), _field(default)))
-    return dataclasses.make_dataclass(f"{slot.title()} {name!r}".replace(" ", "_").replace("'", ""), fields, kw_only=True)
+    return dataclasses.make_dataclass(
+        f"{slot.title()} {name!r}".replace(" ", "_").replace("'", ""), fields, kw_only=True
+    )
 
 
 def _field(default: Any) -> Any:
@@ -131,10 +134,11 @@ def supported(annotation: Any) -> Any:
 def compose(overrides: Iterable[str] = (), config_name: str = "train") -> DictConfig:
     """The config of `lidarfw train OVERRIDES`, not yet resolved.
 
+    An override `--config-dir=DIR` adds a folder of one's own configs, as on the command line.
     Raises ConfigError, RegistryError: what is misspelt, what there is, and the nearest name.
     """
     register()
-    overrides = list(overrides)
+    overrides = with_config_dirs(list(overrides))
     GlobalHydra.instance().clear()
     try:
         with initialize_config_module("lidarfw.conf", version_base="1.3"):
@@ -143,6 +147,29 @@ def compose(overrides: Iterable[str] = (), config_name: str = "train") -> DictCo
         raise
     except HydraException as error:
         raise explain(error, overrides) from error
+    except ValueError as error:  # Hydra's answer to `neck=null`
+        nulls = [o for o in overrides if o.endswith("=null")]
+        hint = f"\n  fix: {nulls[0].removesuffix('null')}[] selects none" if nulls else ""
+        raise ConfigError(f"{error}{hint}") from error
+
+
+def with_config_dirs(arguments: list[str]) -> list[str]:
+    """`--config-dir DIR` (or `=DIR`, or `-cd DIR`) as the override that Hydra's compose understands."""
+    folders, rest = [], []
+    words = iter(arguments)
+    for word in words:
+        if word in ("--config-dir", "-cd"):
+            folders.append(next(words, ""))
+        elif word.startswith("--config-dir="):
+            folders.append(word.partition("=")[2])
+        else:
+            rest.append(word)
+    for folder in folders:
+        if not Path(folder).is_dir():
+            raise ConfigError(f"--config-dir {folder!r} is no folder")
+    return rest + (
+        [f"hydra.searchpath=[{','.join(f'file://{Path(f).resolve()}' for f in folders)}]"] if folders else []
+    )
 
 
 def explain(error: HydraException, overrides: list[str]) -> LidarfwError:
@@ -153,43 +180,51 @@ def explain(error: HydraException, overrides: list[str]) -> LidarfwError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         group, _, name = error.missing_cfg_file.removesuffix(".yaml").rpartition("/")
         if group in SLOTS:
-            return _unknown_component(group, name)
+            return _unknown_component(group, name, list(error.options or ()))
         near = registry.did_you_mean(name, list(error.options or ()))
         options = ", ".join(error.options or ()) or "none"
         return ConfigError(f"no {group or 'config'} named {name!r}.\n  there are: {options}{near}")
     if isinstance(error, OverrideParseException):
         return ConfigError(f"cannot read the override {error.override!r}: {error.message}")
-    return ConfigError(str(error) + _key_hint(error, overrides))
+    return ConfigError(_override_error(error))
 
 
-def _unknown_component(slot: str, name: str) -> LidarfwError:
+def _unknown_component(slot: str, name: str, options: list[str]) -> LidarfwError:
     try:
         registry.find(slot, name)
     except LidarfwError as error:
-        return error
+        presets = sorted(set(options) - set(registry.names(slot)))
+        text = f"\n  presets: {', '.join(presets)}" if presets else ""
+        near = "" if "did you mean" in str(error) else registry.did_you_mean(name, presets)
+        return type(error)(f"{error}{text}{near}")
     return ConfigError(f"{slot} {name!r} could not be loaded")
 
 
-def _key_hint(error: BaseException, overrides: list[str]) -> str:
-    """Nearest valid key for an override such as `head.center.widht=3`, or a hint at `group=name`."""
-    text = f"{error} {error.__cause__ or ''}"
-    match = re.search(r"(?:Could not override|full_key:|Could not append to config.*?) '?([\w./]+)'?", text)
+def _override_error(error: HydraException) -> str:
+    """What is wrong with an override such as `head.center.widht=3`, and the nearest key."""
+    cause = error.__cause__
+    reason = str(cause).splitlines()[0] if cause else str(error)
+    match = re.search(r"(?:override|full_key:|append to config[^:]*:) '?([\w./]+)'?", f"{error}\n{cause or ''}")
     key = match.group(1) if match else ""
     slot, _, rest = key.partition(".")
-    if slot in SLOTS and rest.count(".") >= 1:
-        name, _, option = rest.partition(".")
-        if name in registry.names(slot):
-            options = [*RESERVED, *(LOSS_RESERVED if slot == "loss" else ()), *declaration.read(slot, name).options]
-            near = registry.did_you_mean(option, options)
-            selected = "" if near else f"\n  is {slot} {name!r} selected? add {slot}={name}"
-            return f"\n  options of {slot} {name!r}: {', '.join(options)}{near}{selected}"
-        return registry.did_you_mean(name, registry.names(slot))
-    return registry.did_you_mean(key.partition(".")[0], [*SLOTS, *_top_keys()]) if key else ""
+    name, _, option = rest.partition(".")
+    if slot not in SLOTS or not name:
+        return f"{reason}{registry.did_you_mean(slot, [*SLOTS, *_top_keys()])}"
+    if name not in registry.names(slot):
+        near = registry.did_you_mean(name, registry.names(slot))
+        return f"{slot}.{name} is not selected, and no {slot} has that name.{near}"
+    options = [*RESERVED, *(LOSS_RESERVED if slot == "loss" else ()), *declaration.read(slot, name).options]
+    if option.partition(".")[0] in options and "could not be converted" not in reason and "merging" not in str(error):
+        return f"{slot}.{name} has options but is not selected.\n  fix: add {slot}={name} (or {slot}=[...,{name}])"
+    if option in options:
+        return f"{key}: {reason}"
+    near = registry.did_you_mean(option, options)
+    return f"{slot}.{name} has no option {option!r}.\n  options of {slot} {name!r}: {', '.join(options)}{near}"
 
 
 def _top_keys() -> list[str]:
-    return ["seed", "loader", "splits", "balance", "init", "resume", "trainer", "optimizer", "scheduler", "callbacks",
-            "logger", "experiment", "debug"]  # fmt: skip
+    groups = ["trainer", "optimizer", "scheduler", "callbacks", "logger", "experiment", "debug"]
+    return ["name", "seed", "loader", "splits", "balance", "init", "resume", *groups]
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
@@ -261,4 +296,13 @@ def _allowed_bases() -> tuple[type, ...]:
     return tuple(getattr(importlib.import_module(m), name) for m, names in _ALLOWED_BASES.items() for name in names)
 
 
-__all__ = ["ConfigCompositionException", "check_target", "compose", "explain", "instantiate", "node_class", "register", "to_plain"]
+__all__ = [
+    "ConfigCompositionException",
+    "check_target",
+    "compose",
+    "explain",
+    "instantiate",
+    "node_class",
+    "register",
+    "to_plain",
+]

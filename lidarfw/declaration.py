@@ -257,11 +257,11 @@ class _StaticClass:
     def attribute(self, name: str) -> Any:
         for cls in self._lineage():
             for statement in cls.node.body:
-                target = statement.target if isinstance(statement, ast.AnnAssign) else None
-                target = statement.targets[0] if isinstance(statement, ast.Assign) else target
+                if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
+                    continue
+                target = statement.target if isinstance(statement, ast.AnnAssign) else statement.targets[0]
                 if isinstance(target, ast.Name) and target.id == name:
-                    value = statement.value  # type: ignore[union-attr]
-                    return cls.module.evaluate(value) if value is not None else None
+                    return cls.module.evaluate(statement.value)
         return None
 
     def signature(self, method: str) -> Signature | None:
@@ -279,7 +279,9 @@ class _StaticClass:
                 raise _NotStaticError(function.name)
         positional = [*arguments.posonlyargs, *arguments.args][1:]
         missing = [None] * (len(positional) - len(arguments.defaults))
-        rows = [*zip(positional, [*missing, *arguments.defaults][-len(positional) or None :], [False] * len(positional))]
+        rows = [
+            *zip(positional, [*missing, *arguments.defaults][-len(positional) or None :], [False] * len(positional))
+        ]
         rows += zip(arguments.kwonlyargs, arguments.kw_defaults, [True] * len(arguments.kwonlyargs))
         evaluate = self.module.evaluate
         found = {}
@@ -397,4 +399,14 @@ def all_declarations(slot: str) -> list[Declaration]:
     return found
 
 
-__all__ = ["REQUIRED", "SLOTS", "Declaration", "Option", "Parameter", "all_declarations", "kind_name", "of_class", "read"]
+__all__ = [
+    "REQUIRED",
+    "SLOTS",
+    "Declaration",
+    "Option",
+    "Parameter",
+    "all_declarations",
+    "kind_name",
+    "of_class",
+    "read",
+]

@@ -64,11 +64,12 @@ class PerceptionModel(nn.Module):
 
     def decode(self, outputs: dict[str, Any], batch: Batch) -> list[FrameResult]:
         """Predictions of every head that no later one replaced, post-processed, one result per frame."""
-        heads = {step.id for step in self.plan.of("head")}
-        final = {ref.producer for ref in self.plan.visible if ref.producer in heads}
-        predicted = {name: self._decoded(name, outputs) for name in outputs if name in final}
+        final = {ref.producer for ref in self.plan.visible}
+        predicted = {h.id: self._decoded(h.id, outputs) for h in self.plan.of("head") if h.id in final}
         for step in self.plan.of("postprocessor"):
-            arguments = {p.name: self._argument(step, p, {**outputs, **predicted}, predicted) for p in step.declared.takes}
+            arguments = {
+                p.name: self._argument(step, p, {**outputs, **predicted}, predicted) for p in step.declared.takes
+            }
             result = self.component(step)(**arguments, **self._special(step, batch))
             replaced = step.replaces
             predicted[replaced[0].producer if replaced else step.id] = result
@@ -94,7 +95,9 @@ class PerceptionModel(nn.Module):
             special["meta"] = batch.meta
         return special
 
-    def _argument(self, step: Step, p: Parameter, outputs: dict[str, Any], predicted: dict[str, Any] | None = None) -> Any:
+    def _argument(
+        self, step: Step, p: Parameter, outputs: dict[str, Any], predicted: dict[str, Any] | None = None
+    ) -> Any:
         refs = step.takes[p.name]
         values = [self._value(ref, outputs, predicted) for ref in refs]
         if p.form == "dict":
@@ -124,7 +127,8 @@ class PerceptionModel(nn.Module):
         """The prediction of a head, cut from the graph; decoded once per batch."""
         key = f"{head}.decoded"
         if key not in outputs:
-            decoded: Record = self.head[head.partition(".")[2]].decode(outputs[head])  # type: ignore[operator]
+            step = next(step for step in self.plan.of("head") if step.id == head)
+            decoded: Record = self.component(step).decode(outputs[head])
             outputs[key] = decoded.detach()
         return outputs[key]
 
@@ -167,7 +171,7 @@ class PerceptionModel(nn.Module):
 
     def compute_metrics(self) -> dict[str, float]:
         """All figures, as "metric/key"."""
-        figures = {}
+        figures: dict[str, float] = {}
         for name, metric in self._metrics.items():
             figures |= {f"{name}/{key}": float(value) for key, value in metric.compute().items()}
         return figures

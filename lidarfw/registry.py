@@ -176,7 +176,9 @@ def stale_metadata() -> list[str]:
     messages = []
     for distribution, project in editable_projects().items():
         here = {(slot, n) for slot, points in declared_by(project).items() for n in points}
-        there = {(slot, e.name) for slot, group in _installed().items() for e in group if e.distribution == distribution}
+        there = {
+            (slot, e.name) for slot, group in _installed().items() for e in group if e.distribution == distribution
+        }
         for slot, name in sorted(here ^ there):
             state = "declared but not installed" if (slot, name) in here else "installed but no longer declared"
             messages.append(f"{distribution}: {slot} {name!r} is {state}.\n  fix: pip install -e {project}")

@@ -16,7 +16,9 @@ complete -F _lidarfw lidarfw
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw completion`."""
-    parser.add_argument("shell", nargs="?", choices=("bash", "zsh"), default="bash", help='use: eval "$(lidarfw completion bash)"')
+    parser.add_argument(
+        "shell", nargs="?", choices=("bash", "zsh"), default="bash", help='use: eval "$(lidarfw completion bash)"'
+    )
     parser.add_argument("--line", help=argparse.SUPPRESS)  # the line so far; prints the candidates for its last word
 
 

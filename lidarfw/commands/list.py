@@ -39,8 +39,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _components(slot: str, full: bool) -> list[dict[str, Any]]:
-    rows = [{"slot": slot, "name": e.name, "from": e.origin, **(_details(slot, e) if full else {})} for e in registry.entries(slot)]
-    return rows + [row for row in _yaml_options(slot)]
+    rows = [
+        {"slot": slot, "name": e.name, "from": e.origin, **(_details(slot, e) if full else {})}
+        for e in registry.entries(slot)
+    ]
+    return rows + _yaml_options(slot)
 
 
 def _yaml_options(group: str) -> list[dict[str, Any]]:
@@ -97,5 +100,3 @@ def _print_details(row: dict[str, Any]) -> None:
         if text:
             print(textwrap.indent(textwrap.fill(f"{label}: {text}", 104, subsequent_indent="  "), "      "))
     print(f"      {row['file']}")
-
-

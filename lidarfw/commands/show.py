@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw show`."""
     parser.add_argument("overrides", nargs="*", metavar="OVERRIDE|CKPT", help="as for train, or one checkpoint")
+    parser.add_argument("--config-dir", metavar="DIR", help="folder with configs of your own")
     parser.add_argument("--config", action="store_true", help="print the resolved config too")
 
 
@@ -28,11 +29,12 @@ def run(args: argparse.Namespace) -> int:
     else:
         from lidarfw.config import compose
 
-        model = build(plan(compose(args.overrides)))
+        own = [f"--config-dir={args.config_dir}"] if args.config_dir else []
+        model = build(plan(compose([*own, *args.overrides])))
     if args.config:
-        import yaml
+        from omegaconf import OmegaConf
 
-        print(yaml.safe_dump(model.plan.config, sort_keys=False))
+        print(OmegaConf.to_yaml(OmegaConf.create(model.plan.config)))
     print(table(model.plan, model))
     return 0
 
@@ -46,7 +48,7 @@ def table(plan: Plan, model: PerceptionModel) -> str:
         rows += _rows(step, model)
     widths = [max(len(row[i]) for row in rows) for i in range(3)]
     lines = ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, [*widths, 0], strict=True)).rstrip() for row in rows]
-    total = sum(p.numel() for p in model.parameters())
+    total: int = sum(p.numel() for p in model.parameters())
     versions = ", ".join(f"{name} {version}" for name, version in plan.distributions.items())
     warnings = [f"warning: {text}" for text in plan.warnings]
     return "\n".join([*lines, f"{_count(total)} parameters · {versions}", *warnings])

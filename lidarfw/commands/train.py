@@ -12,7 +12,10 @@ from lidarfw.errors import LidarfwError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw train`: those of Hydra."""
     parser.add_argument(
-        "overrides", nargs="*", metavar="OVERRIDE", help="GROUP=NAME, GROUP=[A,B], KEY=VALUE; Hydra's own flags work: -m, --cfg job"
+        "overrides",
+        nargs="*",
+        metavar="OVERRIDE",
+        help="GROUP=NAME, GROUP=[A,B], KEY=VALUE; Hydra's own flags work: -m, --cfg job",
     )
 
 
@@ -21,10 +24,11 @@ def run(args: argparse.Namespace) -> int:
     from lidarfw import config
     from lidarfw.assembly import plan
 
-    if not any(argument.startswith("-") for argument in args.overrides):
-        plan(config.compose(args.overrides))
+    overrides = config.with_config_dirs(args.overrides)
+    if not any(argument.startswith("-") for argument in overrides):  # a sweep is checked job by job
+        plan(config.compose(overrides))
     config.register()
-    return _hydra(args.overrides)
+    return _hydra(overrides)
 
 
 def _hydra(arguments: list[str]) -> int:

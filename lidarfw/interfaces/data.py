@@ -57,5 +57,8 @@ class Transform(ABC):
         """The data spec after this transform. Default: unchanged."""
         return data
 
+    def prepare(self, dataset: Dataset, workers: int = 1) -> None:
+        """Write the files that the transform needs of the whole dataset. Done by `lidarfw prepare`, not by training."""
+
     def attach(self, dataset: Dataset) -> None:
         """Told once which dataset the frames come from, after `prepare` and before the first call."""

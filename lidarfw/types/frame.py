@@ -14,7 +14,6 @@ from lidarfw.types.record import Record, Rows
 
 if TYPE_CHECKING:
     import torch
-    from torch import Tensor
 else:
     torch = LazyModule("torch")
 
@@ -106,7 +105,9 @@ def take(record: Any, number: int) -> Any:
         return Targets(**{f.name: take(getattr(record, f.name), number) for f in fields(Targets)})
     if isinstance(record, Tracks):
         rows = record.boxes.batch == number
-        return Tracks(record.boxes.sample(number), record.id[rows], None if record.moving is None else record.moving[rows])
+        return Tracks(
+            record.boxes.sample(number), record.id[rows], None if record.moving is None else record.moving[rows]
+        )
     if isinstance(record, RangeImage):
         return _take_range_image(record, number)
     if isinstance(record, Descriptors):
@@ -143,8 +144,8 @@ def _collate_range_images(records: Sequence[RangeImage]) -> RangeImage:
     size = records[0].view.height * records[0].view.width
     starts = [size * sum(r.batch_size for r in records[:i]) for i in range(len(records))]
     pixel = torch.cat([torch.where(r.pixel < 0, -1, r.pixel + s) for r, s in zip(records, starts, strict=True)])
-    maps: list[Tensor] = [torch.cat([getattr(r, n) for r in records]) for n in ("features", "xyz", "mask")]
-    return RangeImage(*maps, pixel, records[0].view)
+    features, xyz, mask = (torch.cat([getattr(r, n) for r in records]) for n in ("features", "xyz", "mask"))
+    return RangeImage(features, xyz, mask, pixel, records[0].view)
 
 
 def collate(frames: Sequence[Frame]) -> Batch:
