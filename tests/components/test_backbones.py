@@ -311,9 +311,7 @@ def test_wrong_options_say_what_to_write() -> None:
         PillarsBackbone(points, cell=(0.0, 0.16))
     with pytest.raises(ConfigError, match="make no grid"):
         SecondBackbone(points, lower=(0.0, 0.0))
-    with pytest.raises(
-        ConfigError, match=r"at least 17 cells along z, its grid has 16\n.*\n.*fix: cells of at most 0.235"
-    ):
+    with pytest.raises(ConfigError, match=r"at least 17 cells along z, its grid has 16\n.*\n.*at most 0.235 m"):
         SecondBackbone(points, cell=(0.1, 0.1, 0.25))
     with pytest.raises(ConfigError, match=r"four stages.*\n.*channels: \[16, 32\]"):
         SecondBackbone(points, channels=(16, 32))
