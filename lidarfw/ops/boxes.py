@@ -185,7 +185,8 @@ def close_pairs(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) bool: the circles round the BEV rectangles touch; where they do not, there is no overlap."""
     reach = a[:, None, 3:5].norm(dim=2) / 2 + b[None, :, 3:5].norm(dim=2) / 2
     apart: Tensor = (a[:, None, 0] - b[:, 0]) ** 2 + (a[:, None, 1] - b[:, 1]) ** 2
-    return apart < reach**2
+    close: Tensor = apart < reach**2
+    return close
 
 
 def overlap_at(a: Tensor, b: Tensor, pairs: Tensor, measure: Callable[[Tensor, Tensor], Tensor] = _bev) -> Tensor:
