@@ -1,0 +1,248 @@
+"""Callbacks and loggers of training that Lightning does not bring."""
+
+from __future__ import annotations
+
+import csv
+import signal
+from collections.abc import Mapping
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning.pytorch as pl
+import torch
+from lightning.pytorch.callbacks import Checkpoint
+from lightning.pytorch.loggers.logger import Logger
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
+
+from lidarfw.files import atomic_path
+
+TERMINATED = 143  # exit code of a process that ended on SIGTERM: 128 + 15
+
+
+class Checkpoints(Checkpoint):
+    """Writes `checkpoints/last.ckpt` and `checkpoints/best.ckpt` of a run.
+
+    last.ckpt: every `every_n_steps` optimizer steps, before every validation, and at the end. It is only written
+    where no gradient is waiting to be accumulated further, so a resumed run is equal bit for bit to an uninterrupted one.
+    best.ckpt: after every validation whose `monitor` figure is the best so far. Higher is better for `mode: max`.
+    """
+
+    def __init__(self, *, every_n_steps: int = 500, monitor: str | None = None, mode: str = "max") -> None:
+        self.every_n_steps = every_n_steps
+        self.monitor = monitor  # default: what the model names, see PerceptionModel.monitor
+        self.sign = {"max": 1.0, "min": -1.0}[mode]
+        self.best: float | None = None
+        self.saved_at = 0  # global step of last.ckpt
+        self.folder = Path("checkpoints")
+        self._before_validation = False
+
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Find the folder; clear away what a killed process left half-written."""
+        self.folder = Path(trainer.default_root_dir) / "checkpoints"
+        self.monitor = self.monitor or getattr(pl_module, "monitor", None)
+        if stage == "fit" and trainer.is_global_zero:
+            for leftover in self.folder.glob(".*.ckpt"):
+                leftover.unlink(missing_ok=True)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Count from where the run starts."""
+        self.saved_at = trainer.global_step
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
+        """Save every n steps. The last batch of an epoch is left to the validation and epoch end that follow."""
+        if self._due(trainer) and not pending_gradients(trainer) and not trainer.is_last_batch:
+            self.save_last(trainer)
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save before a validation: it may take long, and a resumed run then starts with it."""
+        if _in_training(trainer) and trainer.global_step > self.saved_at and not pending_gradients(trainer):
+            self._before_validation = True
+            self.save_last(trainer)
+            self._before_validation = False
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save the best."""
+        figure = trainer.callback_metrics.get(self.monitor or "")
+        if not _in_training(trainer) or figure is None or torch.isnan(figure):
+            return
+        value = float(figure)
+        if self.best is None or self.sign * value > self.sign * self.best:
+            self.best = value
+            trainer.save_checkpoint(self.folder / "best.ckpt")
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save where it is due, and after the last epoch."""
+        if self._due(trainer) or _ends(trainer):
+            self.save_last(trainer)
+
+    def save_last(self, trainer: pl.Trainer) -> None:
+        """Write last.ckpt now."""
+        self.saved_at = trainer.global_step
+        if not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            trainer.save_checkpoint(self.folder / "last.ckpt")
+
+    def _due(self, trainer: pl.Trainer) -> bool:
+        return trainer.global_step - self.saved_at >= self.every_n_steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """The best figure so far."""
+        return {"best": self.best, "monitor": self.monitor}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on with the best figure, if it is still the same one."""
+        if state_dict["monitor"] == self.monitor:
+            self.best = state_dict["best"]
+
+    def on_save_checkpoint(self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Before a validation, note in Lightning's loop state that it is still to run: as one that had begun batch 0."""
+        if not self._before_validation:
+            return
+        progress = checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]
+        progress["total"] = {"ready": 1, "started": 1, "processed": 0, "completed": 0}
+        progress["current"] = {"ready": 0, "started": 0, "processed": 0, "completed": 0}
+        progress["is_last_batch"] = False
+
+
+class Termination(Checkpoint):
+    """On SIGTERM, ends the run with exit code 143, after the optimizer step at hand and a last.ckpt of it.
+
+    Outside of training (set-up, sanity check) it ends at once. A subclass of Checkpoint only so that Lightning runs
+    it after the other callbacks.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._training = False
+        self._before: Any = None
+
+    def install(self) -> None:
+        """Listen from now on."""
+        self._before = signal.signal(signal.SIGTERM, self._receive)
+
+    def uninstall(self) -> None:
+        """Give the signal back to whom it belonged."""
+        signal.signal(signal.SIGTERM, self._before or signal.SIG_DFL)
+
+    def _receive(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        if not self._training:
+            raise SystemExit(TERMINATED)
+
+    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Lightning has just put its own handler in, which ends with exit code 0: put ours back."""
+        signal.signal(signal.SIGTERM, self._receive)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """From here on there is something to save."""
+        self._training = True
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
+        """Save and end, all processes at the same step. A validation that follows saves by itself."""
+        if pending_gradients(trainer) or trainer.is_last_batch or not self._asked(trainer):
+            return
+        self._save(trainer)
+        raise SystemExit(TERMINATED)
+
+    def on_validation_batch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
+        """End: last.ckpt was written right before the validation."""
+        if self.requested:
+            raise SystemExit(TERMINATED)
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Save and end."""
+        if self._asked(trainer) and not _ends(trainer):
+            self._save(trainer)
+            raise SystemExit(TERMINATED)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Everything is saved: from now on a signal ends the process at once."""
+        self._training = False
+        if self.requested:
+            raise SystemExit(TERMINATED)
+
+    def _asked(self, trainer: pl.Trainer) -> bool:
+        return trainer.strategy.reduce_boolean_decision(self.requested, all=False)
+
+    def _save(self, trainer: pl.Trainer) -> None:
+        for callback in trainer.checkpoint_callbacks:
+            if isinstance(callback, Checkpoints):
+                callback.save_last(trainer)
+                rank_zero_info(f"SIGTERM: saved {callback.folder / 'last.ckpt'}; go on with resume=auto")
+
+
+def pending_gradients(trainer: pl.Trainer) -> bool:
+    """Whether gradients of earlier batches wait for more (accumulate_grad_batches)."""
+    return trainer.fit_loop._should_accumulate()
+
+
+def _in_training(trainer: pl.Trainer) -> bool:
+    return trainer.state.fn == "fit" and not trainer.sanity_checking
+
+
+def _ends(trainer: pl.Trainer) -> bool:
+    """Whether the epoch that ends now is the last one."""
+    epochs, steps = trainer.max_epochs, trainer.max_steps
+    last_epoch = epochs not in (None, -1) and trainer.current_epoch + 1 >= (epochs or 0)
+    return last_epoch or trainer.should_stop or (steps != -1 and trainer.global_step >= steps)
+
+
+class MetricsFile(Logger):
+    """`metrics.csv`: one row per step. A resumed run goes on in the same file, from the step it resumed at."""
+
+    def __init__(self, save_dir: str, flush_every: int = 50) -> None:
+        super().__init__()
+        self.path = Path(save_dir) / "metrics.csv"
+        self.flush_every = flush_every
+        self._rows: dict[int, dict[str, Any]] | None = None
+        self._unsaved = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the logger."""
+        return "metrics"
+
+    @property
+    def version(self) -> str:
+        """There is one file per run."""
+        return ""
+
+    @rank_zero_only
+    def log_hyperparams(self, *args: Any, **kwargs: Any) -> None:
+        """The config stands in config.yaml."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Add figures to the row of a step."""
+        at = step or 0
+        if self._rows is None:
+            self._rows = {number: row for number, row in self._read().items() if number < at}
+        row = self._rows.setdefault(at, {})
+        row |= {key: float(value) for key, value in metrics.items()}
+        self._unsaved += 1
+        if self._unsaved >= self.flush_every:
+            self.save()
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write the file."""
+        if not self._unsaved or self._rows is None:
+            return
+        columns = ["step", *sorted({key for row in self._rows.values() for key in row})]
+        with atomic_path(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows({"step": step, **row} for step, row in sorted(self._rows.items()))
+        self._unsaved = 0
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Write what is left."""
+        self.save()
+
+    def _read(self) -> dict[int, dict[str, Any]]:
+        if not self.path.exists():
+            return {}
+        with self.path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        return {int(row.pop("step")): {key: value for key, value in row.items() if value} for row in rows}

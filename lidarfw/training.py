@@ -1,0 +1,460 @@
+"""Training and evaluation: one Lightning module for every model, `train` and `evaluate` from a config."""
+
+from __future__ import annotations
+
+import fnmatch
+import inspect
+import logging
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+import yaml
+from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor, nn
+
+from lidarfw import checkpoint
+from lidarfw.callbacks import Termination
+from lidarfw.config import compose, instantiate, to_plain
+from lidarfw.data import DataModule
+from lidarfw.errors import CheckpointError, ConfigError, LidarfwError, TrainingError
+from lidarfw.files import write_text
+from lidarfw.types import Batch, FrameResult
+
+if TYPE_CHECKING:
+    from lidarfw.model import PerceptionModel
+
+MODEL_KEYS = ("backbone", "neck", "head", "loss", "postprocessor", "filter", "tracker", "retriever", "balance")
+TRAINING_KEYS = ("optimizer", "scheduler", "init", "resume")  # of no use in an evaluation
+log = logging.getLogger(__name__)
+
+
+class UncertaintyBalance(nn.Module):
+    """Learned weights of several losses (Kendall, Gal and Cipolla, CVPR 2018, eq. 10).
+
+    With s the log-variance of a task, its loss counts as exp(-s) * loss / 2 + s / 2.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        super().__init__()
+        self.log_variance = nn.ParameterDict({name: nn.Parameter(torch.zeros(())) for name in names})
+
+    def forward(self, losses: Mapping[str, Tensor]) -> Tensor:
+        """The total of the given losses, scalars by name."""
+        total = torch.stack([0.0 * s for s in self.log_variance.values()]).sum()  # losses left out stay in the graph
+        for name, loss in losses.items():
+            s = self.log_variance[name]
+            total = total + 0.5 * (torch.exp(-s) * loss + s)
+        return total
+
+    def weights(self) -> dict[str, Tensor]:
+        """What each loss is multiplied with now."""
+        return {name: 0.5 * torch.exp(-s.detach()) for name, s in self.log_variance.items()}
+
+
+class PerceptionModule(pl.LightningModule):
+    """Trains and evaluates a PerceptionModel; the only LightningModule of lidarfw.
+
+    optimizer, scheduler: config nodes with `_target_`. about: the description that goes into checkpoints.
+    Every step seeds torch anew from (seed, step, rank), so no random state has to be saved.
+    """
+
+    def __init__(
+        self,
+        model: PerceptionModel,
+        *,
+        optimizer: Mapping[str, Any],
+        scheduler: Mapping[str, Any] | None = None,
+        about: Mapping[str, Any] | None = None,
+        balance: str = "fixed",
+        seed: int = 1,
+    ) -> None:
+        super().__init__()
+        if balance not in ("fixed", "uncertainty"):
+            raise ConfigError(f"balance is {balance!r}; use fixed or uncertainty")
+        self.model = model
+        self.balance = UncertaintyBalance(model.loss) if balance == "uncertainty" else None
+        self.optimizer_node = dict(optimizer)
+        self.scheduler_node = dict(scheduler or {})
+        self.about = dict(about or {})
+        self.seed = seed
+        self.sample_ids: list[str] = []  # of the batch at hand, for messages
+        self._stream: Any = None
+
+    @property
+    def monitor(self) -> str | None:
+        """The logged figure that stands for the run."""
+        return f"val/{self.model.monitor}" if self.model.monitor else None
+
+    # training
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Total loss of a batch; TrainingError where a term is not finite."""
+        self._seed(self.global_step, batch_idx)
+        self.sample_ids = [meta.id for meta in batch.meta]
+        losses = self.model.losses(self.model(batch), batch, self.progress)
+        self._check_terms(losses)
+        sums = {name: torch.stack(list(terms.values())).sum() for name, terms in losses.items()}
+        total = self.balance(sums) if self.balance else torch.stack(list(sums.values())).sum()
+        self._log_losses(losses, total, len(batch))
+        return total
+
+    @property
+    def progress(self) -> float:
+        """Share of the training that is done, 0..1; 1 where its length is not known."""
+        total = self.trainer.estimated_stepping_batches
+        return min(1.0, self.global_step / total) if math.isfinite(total) and total else 1.0
+
+    def _seed(self, *numbers: int) -> None:
+        state = np.random.SeedSequence((self.seed, *numbers, self.global_rank)).generate_state(1, np.uint64)
+        torch.manual_seed(int(state[0]))
+
+    def _check_terms(self, losses: Mapping[str, Mapping[str, Tensor]]) -> None:
+        terms = {f"{name}/{term}": value for name, values in losses.items() for term, value in values.items()}
+        if not terms:
+            raise TrainingError("there is no loss to train on.\n  fix: select a loss, and give one a weight above 0")
+        finite = torch.isfinite(torch.stack([value.detach().float() for value in terms.values()]))
+        if not bool(finite.all()):
+            bad = [f"{name} is {float(terms[name]):g}" for name, ok in zip(terms, finite.tolist(), strict=True) if not ok]
+            raise self._not_finite(f"loss {', '.join(bad)}")
+
+    def _not_finite(self, what: str) -> TrainingError:
+        return TrainingError(
+            f"{what} at step {self.global_step} (epoch {self.current_epoch}), samples {', '.join(self.sample_ids)}.\n"
+            "  training stopped before the optimizer step: the weights are those of the step before, still finite\n"
+            "  fix: look at these samples, lower optimizer.lr, set trainer.gradient_clip_val, or trainer.precision=32-true;"
+            "\n  trainer.detect_anomaly=true names the operation"
+        )
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """TrainingError where a gradient is not finite, unless a loss scaler (16-mixed) takes care of that."""
+        if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
+            return
+        grads = {name: p.grad for name, p in self.named_parameters() if p.grad is not None}
+        norms = torch._foreach_norm(list(grads.values()))
+        finite = torch.isfinite(torch.stack([norm.float() for norm in norms])) if norms else torch.ones(1)
+        if not bool(finite.all()):
+            bad = [n.removeprefix("model.") for n, ok in zip(grads, finite.tolist(), strict=True) if not ok]
+            raise self._not_finite(f"the gradient of {bad[0]} and {len(bad) - 1} other weights is not finite")
+
+    def _log_losses(self, losses: Mapping[str, Mapping[str, Tensor]], total: Tensor, size: int) -> None:
+        terms = {f"loss/{name}/{term}": value.detach() for name, values in losses.items() for term, value in values.items()}
+        if self.balance:
+            terms |= {f"balance/{name}": weight for name, weight in self.balance.weights().items()}
+        terms["learning_rate"] = torch.tensor(self.trainer.optimizers[0].param_groups[0]["lr"])
+        self.log_dict(terms, batch_size=size)
+        self.log("loss/total", total.detach(), batch_size=size, prog_bar=True)
+
+    # evaluation
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """Count the finished frames of a batch into the metrics."""
+        self._seed(batch_idx)
+        self.sample_ids = [meta.id for meta in batch.meta]
+        self.model.update_metrics(self._finished(self.model.decode(self.model(batch), batch)))
+
+    def _finished(self, results: list[FrameResult]) -> list[FrameResult]:
+        """The frames that filters and tracker let out; a stream sees whole sequences in order."""
+        if self._stream is None:
+            return results
+        return [done for result in results for done in self._stream.advance(result)]
+
+    def on_validation_epoch_start(self) -> None:
+        """Start counting."""
+        self.model.reset_metrics()
+        self._stream = self.model.stream() if self.model.filters else None
+
+    def on_validation_epoch_end(self) -> None:
+        """Log all figures."""
+        self._log_metrics("val")
+
+    def _log_metrics(self, stage: str) -> None:
+        if self._stream is not None:
+            self.model.update_metrics(self._stream.flush())
+        figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
+        self.log_dict(figures, sync_dist=True, prog_bar=False)
+        if self.monitor in figures:
+            self.log(f"{stage}_monitor", figures[str(self.monitor)], sync_dist=True, prog_bar=True, logger=False)
+
+    test_step = validation_step
+    on_test_epoch_start = on_validation_epoch_start
+
+    def on_test_epoch_end(self) -> None:
+        """Log all figures."""
+        self._log_metrics("test")
+
+    # optimizer
+
+    def configure_optimizers(self) -> Any:
+        """Optimizer and scheduler of the config."""
+        node = dict(self.optimizer_node)
+        groups = parameter_groups(self.named_parameters(), node.pop("groups", None) or {})
+        optimizer = _build("optimizer", node, groups)
+        if not self.scheduler_node.get("_target_"):
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": self._scheduler(optimizer)}
+
+    def _scheduler(self, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+        node = dict(self.scheduler_node)
+        interval = node.pop("interval", "step")
+        steps = self.trainer.estimated_stepping_batches
+        known = {"max_lr": [group["lr"] for group in optimizer.param_groups], "total_steps": steps, "T_max": steps}
+        factory = instantiate({**node, "_partial_": True})
+        accepted = inspect.signature(factory.func).parameters
+        filled = {name: value for name, value in known.items() if name in accepted and node.get(name) is None}
+        if not math.isfinite(steps) and {"total_steps", "T_max"} & set(filled):
+            raise ConfigError("this scheduler needs to know the length of the run.\n  fix: trainer.max_epochs=N")
+        scheduler = _call("scheduler", factory, optimizer, **filled)
+        return {"scheduler": scheduler, "interval": interval, "monitor": self.monitor, "strict": False}
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add the description."""
+        checkpoint["lidarfw"] = self.about
+
+
+def parameter_groups(named: Iterable[tuple[str, nn.Parameter]], groups: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Optimizer groups by name pattern ("backbone.*": {lr: 1e-4}); the first pattern that fits counts.
+
+    ConfigError for a pattern that fits no trainable parameter.
+    """
+    parameters = {name.removeprefix(checkpoint.PREFIX): p for name, p in named if p.requires_grad}
+    found: dict[str, list[nn.Parameter]] = {pattern: [] for pattern in (*groups, "")}
+    for name, parameter in parameters.items():
+        pattern = next((pattern for pattern in groups if fnmatch.fnmatchcase(name, pattern)), "")
+        found[pattern].append(parameter)
+    for pattern in groups:
+        if not found[pattern]:
+            parts = sorted({".".join(name.split(".")[:2]) for name in parameters})
+            raise ConfigError(
+                f"optimizer.groups: no weight fits {pattern!r} (that no earlier pattern has).\n  there are: {', '.join(parts)}"
+            )
+    return [{"params": members, **(groups.get(pattern) or {})} for pattern, members in found.items() if members]
+
+
+def _build(key: str, node: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
+    return _call(key, instantiate({**node, "_partial_": True}), *args, **kwargs)
+
+
+def _call(key: str, factory: Any, *args: Any, **kwargs: Any) -> Any:
+    try:
+        return factory(*args, **kwargs)
+    except (TypeError, ValueError) as error:
+        accepted = ", ".join(name for name in inspect.signature(factory.func).parameters if name not in ("self", "params"))
+        raise ConfigError(f"{key}: {factory.func.__name__}: {error}\n  its options: {accepted}") from error
+    except pl.utilities.exceptions.MisconfigurationException as error:
+        raise ConfigError(f"{key}: {error}") from error
+
+
+# --- runs -----------------------------------------------------------------------------------------------------------
+
+
+def train(config: DictConfig) -> dict[str, float]:
+    """Train as the config says, in the run folder; the last logged figures.
+
+    Raises LidarfwError for everything that a user can mend, SystemExit(143) after SIGTERM.
+    """
+    from lidarfw.assembly import build, plan
+
+    stop = Termination()
+    stop.install()
+    try:
+        folder = run_folder(config)
+        wired = plan(config)
+        for warning in wired.warnings:
+            rank_zero_warn(warning)
+        pl.seed_everything(config.seed, verbose=False)
+        model = build(wired)
+        _initialise(model, config.init)
+        module = _module(model, to_plain(config), checkpoint.describe(wired))
+        data = DataModule.from_config(config)
+        trainer = make_trainer(config, folder, [stop], validate="val" in data.datasets)
+        if trainer.is_global_zero:
+            write_text(folder / "config.yaml", yaml.safe_dump(wired.config, sort_keys=False, allow_unicode=True))
+        return _fit(trainer, module, data, _resume_from(config.resume, folder))
+    finally:
+        stop.uninstall()
+
+
+def _module(model: PerceptionModel, config: Mapping[str, Any], about: Mapping[str, Any]) -> PerceptionModule:
+    keys = ("optimizer", "scheduler", "balance", "seed")
+    return PerceptionModule(model, about=about, **{key: config[key] for key in keys})
+
+
+def _initialise(model: PerceptionModel, node: Any) -> None:
+    if node is None:
+        return
+    unknown = sorted(set(node) - {"from", "only"})
+    if unknown or not node.get("from"):
+        raise ConfigError("init takes {from: model.ckpt, only: [backbone.NAME]}" + f", not {unknown}" * bool(unknown))
+    report = checkpoint.initialise(model, node["from"], list(node.get("only") or ()))
+    rank_zero_info(f"weights of {node['from']}:\n{report}")
+
+
+def _fit(trainer: pl.Trainer, module: PerceptionModule, data: DataModule, resume: Path | None) -> dict[str, float]:
+    try:
+        trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
+    except (torch.OutOfMemoryError, MemoryError) as error:
+        raise _out_of_memory(error, module) from error
+    except pl.utilities.exceptions.MisconfigurationException as error:
+        raise ConfigError(f"trainer: {error}") from error
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+
+
+def _out_of_memory(error: BaseException, module: PerceptionModule) -> TrainingError:
+    first = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return TrainingError(
+        f"out of memory at step {module.global_step}, samples {', '.join(module.sample_ids)}: {first}\n"
+        "  fix: a smaller loader.batch_size with trainer.accumulate_grad_batches, trainer.precision=bf16-mixed,\n"
+        "  or a smaller model; what was saved goes on with resume=auto"
+    )
+
+
+def run_folder(config: DictConfig) -> Path:
+    """Where a run writes: Hydra's output folder, or `run_dir` of the config."""
+    from hydra.core.hydra_config import HydraConfig
+
+    if config.get("run_dir"):
+        return Path(config.run_dir)
+    if HydraConfig.initialized():
+        return Path(HydraConfig.get().runtime.output_dir)
+    return Path("runs") / str(config.get("name", "train"))
+
+
+def _resume_from(resume: str | None, folder: Path) -> Path | None:
+    last = folder / "checkpoints" / "last.ckpt"
+    if resume is None:
+        return None
+    if resume != "auto":
+        checkpoint.verify(resume)
+        return Path(resume)
+    if not last.exists():
+        rank_zero_info(f"resume=auto: no {last} yet, starting anew")
+        return None
+    return last
+
+
+def make_trainer(
+    config: DictConfig, folder: Path, callbacks: Sequence[pl.Callback] = (), validate: bool = True
+) -> pl.Trainer:
+    """The Lightning trainer of a config, with its loggers and callbacks."""
+    node = to_plain(config.trainer)
+    loggers = [_logger(n, folder) for n in _nodes(config.logger)]
+    options = {
+        "default_root_dir": str(folder),
+        "logger": loggers or False,
+        "callbacks": [*(_build("callbacks", n) for n in _nodes(config.callbacks)), *callbacks],
+        "plugins": [*(instantiate(n) for n in node.pop("plugins", None) or ()), checkpoint.AtomicCheckpointIO()],
+        "use_distributed_sampler": False,  # the data module divides the frames itself
+    }
+    if not validate:
+        options |= {"limit_val_batches": 0}
+    for key in ("strategy", "profiler"):
+        if isinstance(node.get(key), dict):
+            options[key] = instantiate(node.pop(key))
+    trainer: pl.Trainer = _build("trainer", node, **options)
+    return trainer
+
+
+def _nodes(group: DictConfig | None) -> list[dict[str, Any]]:
+    return [node for node in (to_plain(group).values() if group else ()) if node]
+
+
+def _logger(node: dict[str, Any], folder: Path) -> Any:
+    factory = instantiate({**node, "_partial_": True})
+    takes = "save_dir" in inspect.signature(factory.func).parameters and "save_dir" not in node
+    return _call("logger", factory, **({"save_dir": str(folder)} if takes else {}))
+
+
+# --- evaluation -----------------------------------------------------------------------------------------------------
+
+
+def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float]:
+    """Figures ("metric/key") of a checkpoint on the test split of its config.
+
+    The model comes from the checkpoint; dataset, transforms, metric, loader, splits and trainer from its config too,
+    changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`).
+    Raises ConfigError for an override of the model, CheckpointError where the data is not what the model learned.
+    """
+    from lidarfw.assembly import build, plan
+
+    content = checkpoint.read(path)
+    about = checkpoint.description(content, path)
+    config = evaluation_config(checkpoint.config_of(about, path), overrides)
+    model = checkpoint.model_of(content, about, path)
+    wired = plan(config)
+    _check_same_data(model.plan.data, wired.data, path)
+    measured = build(wired)
+    measured.load_state_dict(model.state_dict())
+    module = _module(measured, to_plain(config), about)
+    data = DataModule.from_config(config)
+    trainer = make_trainer(config, Path(path).parent, validate=False)
+    trainer.test(module, datamodule=data, verbose=False)
+    return {name.removeprefix("test/"): float(v) for name, v in trainer.callback_metrics.items() if name.startswith("test/")}
+
+
+def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
+    """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError(f"cannot read the overrides: {error}") from error
+    for override in parsed:
+        _refuse_model_key(override.key_or_group, override.input_line or "")
+    groups = [o for o in parsed if "." not in o.key_or_group and isinstance(stored.get(o.key_or_group), (dict, type(None)))]
+    composed = compose([str(o.input_line) for o in groups])
+    config = OmegaConf.create({**stored, "callbacks": None, "logger": None, "resume": None, "init": None})
+    for override in groups:
+        config[override.key_or_group] = composed[override.key_or_group]
+    for override in parsed:
+        if override not in groups:
+            _set(config, override)
+    return config
+
+
+def _refuse_model_key(key: str, line: str) -> None:
+    root = key.partition(".")[0].partition("@")[0]
+    if root in MODEL_KEYS:
+        raise ConfigError(
+            f"{line}: {root} is part of the model, and the model comes from the checkpoint with its weights.\n"
+            f"  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed\n  fix: train with {line}"
+        )
+    if root in TRAINING_KEYS:
+        raise ConfigError(f"{line}: an evaluation does not train, {root} has no effect.\n  fix: leave it out")
+
+
+def _set(config: DictConfig, override: Any) -> None:
+    key = override.key_or_group
+    if override.is_delete():
+        parent, _, name = key.rpartition(".")
+        OmegaConf.select(config, parent).pop(name) if parent else config.pop(name)
+        return
+    parent = key.rpartition(".")[0]
+    there = OmegaConf.select(config, parent) if parent else config
+    if there is None or (not override.is_add() and not override.is_force_add() and key.rpartition(".")[2] not in there):
+        known = ", ".join(str(k) for k in (there if there is not None else config))
+        raise ConfigError(f"{override.input_line}: there is no {key!r} in the config of the checkpoint.\n  there is: {known}")
+    OmegaConf.update(config, key, override.value(), force_add=True)
+
+
+def _check_same_data(learned: Any, offered: Any, path: str | Path) -> None:
+    if learned.classes != offered.classes:
+        raise CheckpointError(
+            f"{path} was trained on the classes {', '.join(learned.classes)}, this dataset has {', '.join(offered.classes)}."
+            "\n  fix: give the dataset the same classes in the same order"
+        )
+    for name, spec in learned.inputs.items():
+        there = offered.inputs.get(name)
+        if there is None or (there.kind, there.channels) != (spec.kind, spec.channels):
+            raise CheckpointError(f"{path} was trained on {name}: {spec}, this dataset gives {there or 'no such input'}")
+
+
+__all__ = ["LidarfwError", "PerceptionModule", "UncertaintyBalance", "evaluate", "make_trainer", "train"]
