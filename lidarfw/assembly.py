@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from lidarfw import __version__, declaration, registry
 from lidarfw.config import LOSS_RESERVED, RESERVED, node_class, to_plain
 from lidarfw.declaration import REQUIRED, Declaration, Parameter, kind_name
-from lidarfw.errors import AssemblyError, ConfigError
+from lidarfw.errors import AssemblyError, ConfigError, LidarfwError
 from lidarfw.interfaces import Dataset, Transform
 from lidarfw.types import Boxes, DataSpec, Descriptors, PointLabels, Poses, SceneCoords, Spec, Tracks
 
@@ -477,10 +477,12 @@ def _build_step(step: Step, specs: dict[tuple[str, Any, str], Any], data: DataSp
         if name != "data" and name not in given:
             raise AssemblyError(f"{step.id}: __init__ asks for the Spec {name!r}, which is no parameter of its forward")
         arguments[name] = data if name == "data" else given[name]
+    cls = registry.load(step.slot, step.declared.entry.name)
     try:
-        return registry.load(step.slot, step.declared.entry.name)(**arguments, **step.options)
-    except ValueError as error:
-        raise AssemblyError(f"{step.id}: {error}") from error
+        return cls(**arguments, **step.options)
+    except (ValueError, LidarfwError) as error:
+        kind = type(error) if isinstance(error, LidarfwError) else AssemblyError
+        raise kind(f"{step.id}: {error}") from error
 
 
 def _spec_of(step: Step, p: Parameter, specs: dict[tuple[str, Any, str], Any]) -> Any:

@@ -21,12 +21,14 @@ from hydra import initialize_config_module
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from lidarfw import declaration, registry
 from lidarfw.errors import ConfigError, LidarfwError
@@ -142,15 +144,22 @@ def compose(overrides: Iterable[str] = (), config_name: str = "train") -> DictCo
     GlobalHydra.instance().clear()
     try:
         with initialize_config_module("lidarfw.conf", version_base="1.3"):
-            return hydra_compose(config_name, overrides)
+            config = hydra_compose(config_name, overrides, return_hydra_config=True)
     except LidarfwError:
         raise
     except HydraException as error:
         raise explain(error, overrides) from error
+    except YAMLError as error:
+        raise ConfigError(f"a config file is not plain YAML: {error}") from error
     except ValueError as error:  # Hydra's answer to `neck=null`
         nulls = [o for o in overrides if o.endswith("=null")]
         hint = f"\n  fix: {nulls[0].removesuffix('null')}[] selects none" if nulls else ""
         raise ConfigError(f"{error}{hint}") from error
+    # Hydra builds its callbacks by itself, before any code of ours could look at them
+    _check_targets(OmegaConf.to_container(config.hydra.callbacks))
+    with open_dict(config):
+        del config["hydra"]
+    return config
 
 
 def with_config_dirs(arguments: list[str]) -> list[str]:
@@ -170,6 +179,13 @@ def with_config_dirs(arguments: list[str]) -> list[str]:
     return rest + (
         [f"hydra.searchpath=[{','.join(f'file://{Path(f).resolve()}' for f in folders)}]"] if folders else []
     )
+
+
+def without_sweeps(arguments: list[str]) -> list[str]:
+    """The overrides that all jobs of a sweep share: no flags, no `seed=1,2`."""
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    return [text for text, override in zip(overrides, parsed, strict=True) if not override.is_sweep_override()]
 
 
 def explain(error: HydraException, overrides: list[str]) -> LidarfwError:

@@ -25,7 +25,9 @@ def run(args: argparse.Namespace) -> int:
     from lidarfw.assembly import plan
 
     overrides = config.with_config_dirs(args.overrides)
-    if not any(argument.startswith("-") for argument in overrides):  # a sweep is checked job by job
+    if {"-m", "--multirun"} & set(overrides):  # the jobs of a sweep are planned one by one
+        config.compose(config.without_sweeps(overrides))
+    elif not any(argument.startswith("-") for argument in overrides):
         plan(config.compose(overrides))
     config.register()
     return _hydra(overrides)
