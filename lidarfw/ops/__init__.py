@@ -21,7 +21,10 @@ from lidarfw.ops.cells import (
     scatter_sum,
     voxelize_mean,
 )
+from lidarfw.ops.neighbors import ball_query, farthest_points, knn, three_interpolate
 from lidarfw.ops.nms import nms_circle, nms_rotated
+from lidarfw.ops.pose import kabsch, ransac_pose, transform
+from lidarfw.ops.range_image import range_knn, range_project, residual_images
 from lidarfw.ops.sparse_conv import (
     SparseAvgPool3d,
     SparseConv3d,
@@ -42,12 +45,16 @@ __all__ = [
     "SparseSequential",
     "SubmanifoldConv3d",
     "assign_cells",
+    "ball_query",
     "box_corners",
+    "farthest_points",
     "from_dense",
     "giou_3d",
     "group_points",
     "iou_3d",
     "iou_bev",
+    "kabsch",
+    "knn",
     "nearest_bev_iou",
     "nms_circle",
     "nms_rotated",
@@ -56,9 +63,15 @@ __all__ = [
     "paired_iou_bev",
     "points_in_boxes",
     "points_in_boxes_mask",
+    "range_knn",
+    "range_project",
+    "ransac_pose",
+    "residual_images",
     "scatter_max",
     "scatter_mean",
     "scatter_sum",
+    "three_interpolate",
     "to_dense",
+    "transform",
     "voxelize_mean",
 ]

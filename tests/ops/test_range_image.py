@@ -1,0 +1,104 @@
+"""Range projection, residuals and the label vote against loops over points."""
+
+import math
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+
+from lidarfw.ops import range_knn, range_project, residual_images
+from lidarfw.types import Points, RangeView
+
+VIEW = RangeView(8, 32, math.radians(20), math.radians(-25))
+
+
+def cloud(count: int, batch_size: int, seed: int) -> Points:
+    random = torch.Generator().manual_seed(seed)
+    xyz = torch.randn(count, 3, generator=random) * torch.tensor([10.0, 10.0, 2.0])
+    batch = torch.randint(batch_size, (count,), generator=random)
+    return Points(xyz, torch.rand(count, 2, generator=random), batch, batch_size)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 300), st.integers(1, 3), st.integers(0, 10**6))
+def test_projection_keeps_the_nearest_point(count: int, batch_size: int, seed: int) -> None:
+    points = cloud(count, batch_size, seed)
+    points = Points.cat([points, points]).replace(batch_size=batch_size)  # equally near points: the first wins
+    image = range_project(points, VIEW)
+    row, column, distance, inside = VIEW.project(points.xyz)
+    best: dict[int, int] = {}
+    for number in range(len(points)):
+        pixel = int((points.batch[number] * VIEW.height + row[number]) * VIEW.width + column[number])
+        assert image.pixel[number] == (pixel if inside[number] else -1)
+        if inside[number] and (pixel not in best or distance[number] < distance[best[pixel]]):
+            best[pixel] = number
+    assert image.mask.sum() == len(best)
+    features, xyz = image.features.permute(0, 2, 3, 1).reshape(-1, 3), image.xyz.permute(0, 2, 3, 1).reshape(-1, 3)
+    for pixel, number in best.items():
+        assert image.mask.flatten()[pixel]
+        assert torch.equal(xyz[pixel], points.xyz[number])
+        assert torch.equal(features[pixel, 1:], points.features[number])
+        torch.testing.assert_close(features[pixel, 0], distance[number])
+    assert features[~image.mask.flatten()].abs().sum() == 0
+
+
+def test_projection_passes_gradients_to_features() -> None:
+    points = cloud(60, 2, 0)
+    features = points.features.double().requires_grad_()
+    points = points.replace(xyz=points.xyz.double())
+    assert torch.autograd.gradcheck(lambda f: range_project(points.replace(features=f), VIEW).features, features)
+
+
+def test_residuals_compare_ranges_pixel_by_pixel() -> None:
+    now = Points(torch.tensor([[10.0, 0.1, 0], [0.1, 20, 0]]), torch.zeros(2, 0), torch.zeros(2, dtype=torch.long))
+    past = now.replace(xyz=torch.tensor([[8.0, 0.08, 0], [0.1, -20, 0]]))
+    image = range_project(now, VIEW)
+    residual = residual_images(image, [past, now])
+    assert residual.shape == (1, 2, 8, 32)
+    pixel = image.pixel[0]
+    assert residual[0, 0].flatten()[pixel].item() == pytest.approx(0.2, abs=1e-5)
+    residual[0, 0].view(-1)[pixel] = 0
+    assert residual.abs().max() < 1e-6
+
+
+def vote(image, labels, distance, window=5, neighbors=5, cutoff=1.0, sigma=1.0) -> list[int]:
+    """The vote point by point, straight from the paper's description."""
+    margin, (_, height, width) = window // 2, labels.shape
+    offset = np.arange(window) - margin
+    bell = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * sigma**2))
+    weight = 1 - bell / bell.sum()
+    ranges, found = image.xyz.norm(dim=1), []
+    for pixel, own in zip(image.pixel.tolist(), distance.tolist(), strict=True):
+        if pixel < 0:
+            found.append(-1)
+            continue
+        b, row, column = pixel // (height * width), pixel // width % height, pixel % width
+        near = []
+        for dy in range(-margin, margin + 1):
+            for dx in range(-margin, margin + 1):
+                y, x = row + dy, (column + dx) % width
+                if 0 <= y < height and image.mask[b, y, x]:
+                    apart = abs(float(ranges[b, y, x]) - own) * weight[dy + margin, dx + margin]
+                    near.append((0.0 if dy == dx == 0 else apart, int(labels[b, y, x])))
+        votes = [label for apart, label in sorted(near, key=lambda n: n[0])[:neighbors] if apart <= cutoff]
+        found.append(min(set(votes), key=lambda label: (-votes.count(label), label)))
+    return found
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 250), st.integers(1, 2), st.integers(0, 10**6), st.sampled_from([(3, 3), (5, 5), (5, 1), (7, 9)]))
+def test_label_vote_equals_a_loop(count: int, batch_size: int, seed: int, window: tuple[int, int]) -> None:
+    points = cloud(count, batch_size, seed)
+    image = range_project(points, VIEW)
+    labels = torch.randint(3, image.mask.shape, generator=torch.Generator().manual_seed(seed))
+    distance = points.xyz.norm(dim=1)
+    ours = range_knn(image, labels, distance, window=window[0], neighbors=window[1], cutoff=2.0)
+    assert ours.tolist() == vote(image, labels, distance, window[0], window[1], 2.0)
+
+
+def test_an_even_window_is_refused() -> None:
+    image = range_project(cloud(10, 1, 0), VIEW)
+    with pytest.raises(ValueError, match="window must be odd"):
+        range_knn(image, torch.zeros(1, 8, 32, dtype=torch.long), torch.zeros(10), window=4)
