@@ -196,7 +196,7 @@ def boxes_from_labels(labels: Sequence[Label], calibration: Calibration, classes
 
     Neutral are Van for Car and Person_sitting for Pedestrian (label of that class) and DontCare (label -1, only
     box2d is known: centre, size and yaw are 0); a type that stands in `classes` is never neutral. Other types are
-    left out. `row` is the place in `labels`.
+    left out. `row` is the place in `labels`; of results the score is taken too.
     """
     known = {name: index for index, name in enumerate(classes)}
     neutral = {name: known[base] for name, base in NEUTRAL.items() if base in known} | {"DontCare": -1}
@@ -220,7 +220,9 @@ def _boxes(labels: Sequence[Label], chosen: Sequence[tuple[int, int]], calibrati
     )
     boxes[dont_care] = 0
     index = np.array(chosen, dtype=np.int64).reshape(-1, 2)
+    score = [1.0 if label.score is None else label.score for label in picked]
     return Boxes.from_tensor(torch.tensor(boxes, dtype=torch.float32), torch.tensor(index[:, 1])).replace(
+        score=torch.tensor(score, dtype=torch.float32),
         box2d=torch.tensor(table[:, 7:11], dtype=torch.float32),
         truncation=torch.tensor(table[:, 11], dtype=torch.float32),
         alpha=torch.tensor(table[:, 12], dtype=torch.float32),
