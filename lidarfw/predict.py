@@ -1,0 +1,341 @@
+"""From scan and picture files to results and pictures: what `lidarfw predict` does, for use from Python too."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidarfw import draw, kitti
+from lidarfw.assembly import make_transforms
+from lidarfw.errors import DataError
+from lidarfw.files import atomic_path, write_text
+from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
+from lidarfw.model import PerceptionModel
+from lidarfw.types import Boxes, Camera, Frame, FrameMeta, FrameResult, Image, PointLabels, Points, Spec, Targets
+
+PERIOD = 0.1  # seconds between the scans of a folder, where nothing says otherwise
+FORMATS = ("json", "npz", "kitti")
+
+
+@dataclass(frozen=True)
+class Source:
+    """The files of one frame."""
+
+    path: Path  # the scan, or the picture of a model without LiDAR
+    calibration: Path | None = None
+    image: Path | None = None
+
+    @property
+    def id(self) -> str:
+        """Name of the frame, and of the files written for it."""
+        return re.sub(r"\.(pcd\.bin|[^.]+)$", "", self.path.name, flags=re.IGNORECASE)
+
+
+# From files to frames
+
+
+def find_sources(
+    paths: Sequence[str | Path], lidar: bool, calibration: Path | None = None, image: Path | None = None
+) -> list[Source]:
+    """The frames in files and folders; a folder gives its scans (pictures, unless `lidar`) in order of their names.
+
+    Calibration and picture of a scan in KITTI's layout (ROOT/velodyne/ID.bin) are found beside it. DataError where
+    there is nothing, or two frames would write the same files.
+    """
+    suffixes = tuple(SCAN_READERS) if lidar else IMAGE_SUFFIXES
+    files = [file for path in paths for file in _files(Path(path), suffixes)]
+    if image is not None and len(files) != 1:
+        raise DataError(f"--image is the picture of one scan, and there are {len(files)}; leave it out")
+    sources = [_source(file, calibration, image, lidar) for file in files]
+    seen: dict[str, Source] = {}
+    for source in sources:
+        if source.id in seen:
+            raise DataError(
+                f"{seen[source.id].path} and {source.path} would both write {source.id}.*\n"
+                f"  fix: predict them in two runs with an -o of their own"
+            )
+        seen[source.id] = source
+    return sources
+
+
+def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    if not path.is_dir():
+        return [path]
+    files = [file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
+    if not files:
+        raise DataError(f"{path}: no file in this folder ends in {', '.join(suffixes)}")
+    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
+
+
+def _source(file: Path, calibration: Path | None, image: Path | None, lidar: bool) -> Source:
+    if not lidar:
+        return Source(file, calibration, file)
+    root, name = file.absolute().parent.parent, Source(file).id
+    beside = root / "calib" / f"{name}.txt"
+    pictures = [root / "image_2" / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
+    return Source(
+        file,
+        calibration or (beside if beside.is_file() else None),
+        image or next((picture for picture in pictures if picture.is_file()), None),
+    )
+
+
+class FrameReader:
+    """Makes the frames that a model learned from out of files: inputs of the model's data spec, then its transforms."""
+
+    def __init__(
+        self, model: PerceptionModel, columns: int | None = None, repair: bool = False, intensity_max: float = 1.0
+    ) -> None:
+        """Options are those of `lidarfw.io.read_points`; intensities are divided by `intensity_max`."""
+        self.data = model.plan.data
+        self.columns, self.repair, self.intensity_max = columns, repair, intensity_max
+        self.transforms = make_transforms(model.plan.config, training=False)
+        self.needed = needed_inputs(model)
+        self.left_out: tuple[str, ...] = ()  # features of the last scan that the model does not know
+
+    @property
+    def lidar(self) -> bool:
+        """Whether the model needs scans, and not pictures alone."""
+        return any(self.data.inputs[name].kind is not Image for name in self.needed)
+
+    def read(self, source: Source, sequence: str = "", index: int = 0) -> Frame:
+        """The frame of one source. DataError where a file is broken or is not what the model needs."""
+        picture = read_image(source.image) if source.image else None
+        cameras = _cameras(source, picture)
+        path, images = str(source.path), {kitti.IMAGE: str(source.image)} if source.image else {}
+        meta = FrameMeta(source.id, sequence or source.id, index, index * PERIOD, cameras, path, images)
+        inputs: dict[str, Any] = {}
+        for name, spec in self.data.inputs.items():
+            if spec.kind is Points and self.lidar:
+                inputs[name] = self._points(source, spec)
+            elif spec.kind is Image and (picture is not None or name in self.needed):
+                inputs[name] = _image(source, spec, picture, cameras)
+        frame = Frame(inputs, Targets(), meta)
+        for transform in self.transforms:
+            frame = transform(frame, np.random.default_rng(0))
+        self._check_inputs(source, frame)
+        return frame
+
+    def _points(self, source: Source, spec: Spec) -> Points:
+        scan = read_points(source.path, self.columns, self.repair)
+        if scan.features.shape[1] < spec.channels:
+            raise DataError(
+                f"{source.path}: has {scan.features.shape[1]} features per point ({', '.join(scan.names) or 'none'}), "
+                f"the model learned from {spec.channels}"
+            )
+        self.left_out = scan.names[spec.channels :]
+        features = torch.tensor(scan.features[:, : spec.channels])
+        if spec.channels:
+            features[:, 0] /= self.intensity_max
+            _check_intensity(source.path, features[:, 0])
+        time = torch.zeros(len(features)) if self.data.sweeps > 1 else None
+        return Points.from_scan(torch.tensor(scan.xyz), features, time)
+
+    def _check_inputs(self, source: Source, frame: Frame) -> None:
+        missing = [name for name in self.needed if name not in frame.inputs]
+        if missing:
+            kinds = ", ".join(f"{name} ({self.data.inputs[name].kind.__name__})" for name in missing)
+            raise DataError(f"{source.path}: the model also needs {kinds}, which files alone do not give")
+
+
+def needed_inputs(model: PerceptionModel) -> set[str]:
+    """Names of the data inputs that the parts of the model read at inference."""
+    slots = ("backbone", "neck", "head", "postprocessor", "filter", "tracker", "retriever")
+    refs = [ref for slot in slots for step in model.plan.of(slot) for found in step.takes.values() for ref in found]
+    return {ref.producer.removeprefix("data.") for ref in refs if ref.producer.startswith("data.")}
+
+
+def _check_intensity(path: Path, values: torch.Tensor) -> None:
+    low, high = float(values.min()), float(values.max())
+    if low < 0 or high > 1:
+        guess = 255 if high <= 255 else 65535
+        raise DataError(
+            f"{path}: intensity is {low:g}..{high:g}, models learn from 0..1.\n"
+            f"  fix: --intensity-max {guess} divides it (or --columns N, if the file has not the usual columns)"
+        )
+
+
+def _cameras(source: Source, picture: draw.Picture | None) -> dict[str, Camera]:
+    if source.calibration is None:
+        return {}
+    width, height = (picture.shape[1], picture.shape[0]) if picture is not None else (1242, 375)
+    return kitti.read_calibration(source.calibration).cameras(width, height)
+
+
+def _image(source: Source, spec: Spec, picture: draw.Picture | None, cameras: dict[str, Camera]) -> Image:
+    """The picture as an input, at the size that the model learned from: smaller ones get a black border."""
+    if picture is None:
+        raise DataError(f"{source.path}: the model needs a picture of the camera too\n  fix: --image FILE")
+    height, width = picture.shape[:2]
+    learned = spec.geometry if isinstance(spec.geometry, Camera) else None
+    size = (learned.width, learned.height) if learned else (width, height)
+    camera = cameras.get(kitti.IMAGE) or (learned if size == (width, height) else None)
+    if camera is None:
+        raise DataError(
+            f"{source.path}: the calibration of the camera is not known\n  fix: --calib FILE (KITTI's form)"
+        )
+    if width > size[0] or height > size[1]:
+        raise DataError(
+            f"{source.image}: is {width} x {height} pixels, the model learned from at most {size[0]} x {size[1]}"
+        )
+    canvas = torch.zeros(1, 3, size[1], size[0])
+    canvas[0, :, :height, :width] = torch.tensor(picture.transpose(2, 0, 1)) / 255
+    return Image(canvas, (camera.cropped(0, 0, *size),))
+
+
+# Through the model
+
+
+def predict(
+    model: PerceptionModel, reader: FrameReader, sources: Iterable[Source], stream: bool = False
+) -> Iterator[FrameResult]:
+    """Results in order of the sources, on the CPU.
+
+    With `stream` the sources are one sequence, `PERIOD` apart: filters keep their state and the tracker follows
+    objects; without, every one stands for itself.
+    """
+    running = model.stream()
+    for index, source in enumerate(sources):
+        frame = reader.read(source, "sequence", index) if stream else reader.read(source)
+        for result in [*running.step(frame), *([] if stream else running.flush())]:
+            yield _on_cpu(result)
+    for result in running.flush():
+        yield _on_cpu(result)
+
+
+def _on_cpu(result: FrameResult) -> FrameResult:
+    predictions = {name: value.to("cpu") for name, value in result.predictions.items()}
+    inputs = {name: value.to("cpu") for name, value in result.inputs.items()}
+    tracks = None if result.tracks is None else result.tracks.to("cpu")
+    return dataclasses.replace(result, predictions=predictions, inputs=inputs, tracks=tracks)
+
+
+def keep_scores(result: FrameResult, score: float) -> FrameResult:
+    """The result without boxes and tracks below a score."""
+    kept = {n: v[v.score >= score] if isinstance(v, Boxes) else v for n, v in result.predictions.items()}
+    tracks = result.tracks
+    if tracks is not None:
+        chosen = tracks.boxes.score >= score
+        moving = None if tracks.moving is None else tracks.moving[chosen]
+        tracks = tracks.replace(boxes=tracks.boxes[chosen], id=tracks.id[chosen], moving=moving)
+    return dataclasses.replace(result, predictions=kept, tracks=tracks)
+
+
+# To files
+
+
+def save(result: FrameResult, folder: Path, form: str, classes: Sequence[str]) -> list[Path]:
+    """Write one result as `form` (json, npz, kitti); the files, named by the frame."""
+    if form == "json":
+        path = folder / f"{result.meta.id}.json"
+        write_text(path, json.dumps(to_plain(result, classes), indent=1) + "\n")
+        return [path]
+    if form == "npz":
+        path = folder / f"{result.meta.id}.npz"
+        with atomic_path(path) as temporary:
+            np.savez_compressed(temporary, allow_pickle=False, **_arrays(result, classes))
+        return [path]
+    return _save_kitti(result, folder, classes)
+
+
+def _save_kitti(result: FrameResult, folder: Path, classes: Sequence[str]) -> list[Path]:
+    boxes = {name: value for name, value in result.predictions.items() if isinstance(value, Boxes)}
+    if not boxes:
+        there = ", ".join(f"{n} ({type(v).__name__})" for n, v in result.predictions.items()) or "nothing"
+        raise DataError(f"KITTI text holds boxes, and this model gives {there}\n  fix: --format json")
+    paths = []
+    for name, value in boxes.items():
+        path = (folder / name if len(boxes) > 1 else folder) / f"{result.meta.id}.txt"
+        kitti.write_results(path, kitti.labels_from_boxes(value, classes, result.meta.cameras))
+        paths.append(path)
+    return paths
+
+
+def to_plain(result: FrameResult, classes: Sequence[str]) -> dict[str, Any]:
+    """A result as numbers, strings, lists and dicts. Metres and radians in the sensor frame (x ahead, y left, z up)."""
+    plain: dict[str, Any] = {"id": result.meta.id, "path": result.meta.path, "classes": list(classes)}
+    plain["predictions"] = {
+        name: {"kind": type(value).__name__, **_fields(value, classes)} for name, value in result.predictions.items()
+    }
+    if result.tracks is not None:
+        rows = _rows(result.tracks.boxes, classes)
+        plain["tracks"] = [{"id": number, **row} for number, row in zip(result.tracks.id.tolist(), rows, strict=True)]
+    return plain
+
+
+def _fields(value: Any, classes: Sequence[str]) -> dict[str, Any]:
+    if isinstance(value, Boxes):
+        return {"boxes": _rows(value, classes)}
+    if isinstance(value, PointLabels):
+        return {"label": value.label.tolist()}
+    return {name: tensor.tolist() for name, tensor in _tensors(value).items()}
+
+
+def _rows(boxes: Boxes, classes: Sequence[str]) -> list[dict[str, Any]]:
+    """One dict per box: class, score, center, size, yaw, and what else the head predicts."""
+    columns = {name: tensor.tolist() for name, tensor in _tensors(boxes).items() if name not in ("batch", "label")}
+    names = [classes[label] if 0 <= label < len(classes) else str(label) for label in boxes.label.tolist()]
+    order = ["score", "center", "size", "yaw", *(n for n in columns if n not in ("score", "center", "size", "yaw"))]
+    return [{"class": name, **{key: columns[key][i] for key in order}} for i, name in enumerate(names)]
+
+
+def _tensors(record: Any) -> dict[str, torch.Tensor]:
+    found = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    return {name: value for name, value in found.items() if isinstance(value, torch.Tensor)}
+
+
+def _arrays(result: FrameResult, classes: Sequence[str]) -> dict[str, np.ndarray]:
+    """Every tensor of the predictions as PRODUCER.FIELD ("head.center.yaw"), those of the tracks as tracks.FIELD."""
+    arrays = {
+        f"{name}.{key}": tensor.numpy()
+        for name, value in result.predictions.items()
+        for key, tensor in _tensors(value).items()
+    }
+    if result.tracks is not None:
+        arrays |= {f"tracks.{key}": tensor.numpy() for key, tensor in _tensors(result.tracks.boxes).items()}
+        arrays |= {f"tracks.{key}": tensor.numpy() for key, tensor in _tensors(result.tracks).items()}
+    return {**arrays, "classes": np.array(list(classes), dtype=np.str_)}
+
+
+def save_pictures(result: FrameResult, folder: Path, classes: Sequence[str]) -> list[Path]:
+    """ID_bev.png with the scan from above, and ID_image.png where picture and calibration are known."""
+    pictures = pictures_of(result, classes)
+    paths = [folder / f"{result.meta.id}_{name}.png" for name in pictures]
+    for path, picture in zip(paths, pictures.values(), strict=True):
+        draw.write_png(path, picture)
+    return paths
+
+
+def pictures_of(result: FrameResult, classes: Sequence[str]) -> dict[str, draw.Picture]:
+    """Pictures of a result by name: bev, image. Truth is drawn where the result has it."""
+    found = result.tracks or _all_boxes(result)
+    truth = result.targets.boxes if result.targets else None
+    pictures = {}
+    scan = next((value for value in result.inputs.values() if isinstance(value, Points)), None)
+    if scan is not None:
+        pictures["bev"] = draw.birds_eye(scan, found, truth, classes, title=result.meta.id)
+    camera = result.meta.cameras.get(kitti.IMAGE)
+    picture = _picture_of(result)
+    if camera is not None and picture is not None and found is not None:
+        pictures["image"] = draw.camera_view(picture, camera, found, truth, classes)
+    return pictures
+
+
+def _picture_of(result: FrameResult) -> draw.Picture | None:
+    if kitti.IMAGE in result.meta.images:
+        return read_image(result.meta.images[kitti.IMAGE])
+    image = next((value for value in result.inputs.values() if isinstance(value, Image)), None)
+    return None if image is None else (image.features[0].permute(1, 2, 0).clamp(0, 1) * 255).byte().numpy()
+
+
+def _all_boxes(result: FrameResult) -> Boxes | None:
+    boxes = [value for value in result.predictions.values() if isinstance(value, Boxes)]
+    return Boxes.cat(boxes) if boxes else None
