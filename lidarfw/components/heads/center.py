@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from lidarfw.components.layers import conv_block
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Head
 from lidarfw.types import BEV, Boxes, DataSpec, Grid, Record, Spec
@@ -59,7 +60,7 @@ class _GroupMaps(nn.Module):
         super().__init__()
         widths = {"heatmap": classes, "offset": 2, "height": 1, "size": 3, "yaw": 2}
         widths |= {"velocity": 2} if velocity else {}
-        self.hidden = _conv_block(channels, channels * len(widths))
+        self.hidden = conv_block(channels, channels * len(widths))
         self.last = nn.ModuleDict({name: nn.Conv2d(channels, width, 3, padding=1) for name, width in widths.items()})
         for name, conv in self.last.items():
             nn.init.constant_(conv.get_parameter("bias"), HEATMAP_BIAS if name == "heatmap" else 0.0)
@@ -68,11 +69,6 @@ class _GroupMaps(nn.Module):
         hidden = self.hidden(shared).chunk(len(self.last), 1)
         heatmap, *regression = (conv(part) for conv, part in zip(self.last.values(), hidden, strict=True))
         return heatmap, torch.cat(regression, 1)
-
-
-def _conv_block(in_channels: int, out_channels: int) -> nn.Sequential:
-    conv = nn.Conv2d(in_channels, out_channels, 3, padding=1, bias=False)
-    return nn.Sequential(conv, nn.BatchNorm2d(out_channels, eps=1e-3, momentum=0.01), nn.ReLU(inplace=True))
 
 
 def _group_numbers(classes: tuple[str, ...], groups: list[list[str]] | None) -> list[int]:
@@ -116,7 +112,7 @@ class CenterHead(Head):
         super().__init__()
         numbers = _group_numbers(data.classes, groups)
         self.max_objects, self.score_threshold = max_objects, score_threshold
-        self.shared = _conv_block(bev.channels, channels)
+        self.shared = conv_block(bev.channels, channels)
         sizes = [numbers.count(number) for number in range(len(groups or [[]]))]
         self.groups = nn.ModuleList(_GroupMaps(channels, size, velocity) for size in sizes)
         by_group = sorted(range(len(numbers)), key=lambda label: numbers[label])  # class of each stacked map
