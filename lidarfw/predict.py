@@ -236,7 +236,7 @@ def save(result: FrameResult, folder: Path, form: str, classes: Sequence[str]) -
     """Write one result as `form` (json, npz, kitti); the files, named by the frame."""
     if form == "json":
         path = folder / f"{result.meta.id}.json"
-        write_text(path, json.dumps(to_plain(result, classes), indent=1) + "\n")
+        write_text(path, _json(to_plain(result, classes)))
         return [path]
     if form == "npz":
         path = folder / f"{result.meta.id}.npz"
@@ -244,6 +244,12 @@ def save(result: FrameResult, folder: Path, form: str, classes: Sequence[str]) -
             np.savez_compressed(temporary, allow_pickle=False, **_arrays(result, classes))
         return [path]
     return _save_kitti(result, folder, classes)
+
+
+def _json(plain: dict[str, Any]) -> str:
+    """Indented, with each list of numbers on a line of its own."""
+    text = json.dumps(plain, indent=1)
+    return re.sub(r"\[\s+([^][{}\"]*?)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text) + "\n"
 
 
 def _save_kitti(result: FrameResult, folder: Path, classes: Sequence[str]) -> list[Path]:
@@ -276,12 +282,17 @@ def _fields(value: Any, classes: Sequence[str]) -> dict[str, Any]:
         return {"boxes": _rows(value, classes)}
     if isinstance(value, PointLabels):
         return {"label": value.label.tolist()}
-    return {name: tensor.tolist() for name, tensor in _tensors(value).items()}
+    return {name: _numbers(tensor) for name, tensor in _tensors(value).items()}
+
+
+def _numbers(tensor: torch.Tensor) -> Any:
+    """Nested lists, without the digits that float32 does not have."""
+    return tensor.double().round(decimals=5).tolist() if tensor.is_floating_point() else tensor.tolist()
 
 
 def _rows(boxes: Boxes, classes: Sequence[str]) -> list[dict[str, Any]]:
     """One dict per box: class, score, center, size, yaw, and what else the head predicts."""
-    columns = {name: tensor.tolist() for name, tensor in _tensors(boxes).items() if name not in ("batch", "label")}
+    columns = {name: _numbers(tensor) for name, tensor in _tensors(boxes).items() if name not in ("batch", "label")}
     names = [classes[label] if 0 <= label < len(classes) else str(label) for label in boxes.label.tolist()]
     order = ["score", "center", "size", "yaw", *(n for n in columns if n not in ("score", "center", "size", "yaw"))]
     return [{"class": name, **{key: columns[key][i] for key in order}} for i, name in enumerate(names)]
