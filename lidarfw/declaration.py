@@ -92,11 +92,16 @@ def kind_name(kind: Any) -> str:
 
 @functools.lru_cache(maxsize=512)
 def _read(entry: registry.Entry) -> Declaration:
+    return from_source(entry) or _declare(entry, _ImportedClass(registry.load(entry.slot, entry.name)))
+
+
+def from_source(entry: registry.Entry) -> Declaration | None:
+    """The declaration by the source alone, or None where the source cannot be understood without running it."""
     module, _, name = entry.value.partition(":")
     try:
         return _declare(entry, _StaticClass(*_Module.of(module).find_class(name)))
     except _NotStaticError:
-        return _declare(entry, _ImportedClass(registry.load(entry.slot, entry.name)))
+        return None
 
 
 def read(slot: str, name: str) -> Declaration:

@@ -155,8 +155,9 @@ def editable_projects() -> dict[str, Path]:
     """Project folder of every distribution that is installed in editable mode and has lidarfw entry points."""
     found = {}
     for distribution in {entry.distribution for group in _installed().values() for entry in group}:
-        text = importlib.metadata.distribution(distribution).read_text("direct_url.json")
-        url = json.loads(text) if text else {}
+        # beside a checkout's own .egg-info, which knows no origin, the installed metadata is a second answer
+        texts = (d.read_text("direct_url.json") for d in importlib.metadata.distributions(name=distribution))
+        url = json.loads(next(filter(None, texts), "{}"))
         if url.get("dir_info", {}).get("editable"):
             found[distribution] = Path(unquote(urlparse(url["url"]).path))
     return found

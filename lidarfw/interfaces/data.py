@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from lidarfw.types import DataSpec, Frame, FrameMeta
 
@@ -19,6 +19,7 @@ class Dataset(ABC):
     is asked before any file is there. `prepare` may download, generate or index.
     """
 
+    example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
     spec: DataSpec
     split: str  # train, val, test, or what the dataset names
 
@@ -47,6 +48,7 @@ class Transform(ABC):
     sampling, say) gets it by `attach`.
     """
 
+    example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
     train_only: bool = False  # augmentations are left out in evaluation and prediction
 
     @abstractmethod

@@ -23,6 +23,7 @@ class Component(nn.Module):
     """Base of all components that live in the model."""
 
     provides: Provides
+    example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit: required ones, sizes fit for a test
 
 
 class Backbone(Component):
@@ -111,3 +112,4 @@ class Metric(torchmetrics.Metric):
     """
 
     monitor: ClassVar[str]
+    example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit

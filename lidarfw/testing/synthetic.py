@@ -39,12 +39,13 @@ _FEWEST = 5  # returns that make an object worth learning
 _CAMERA_HEIGHT = 0.1  # metres above the scanner
 CAMERA = Camera(
     "pinhole",
-    208,
-    64,
-    (104.0, 104.0, 104.0, 24.0),
+    416,
+    128,
+    (208.0, 208.0, 208.0, 48.0),
     (),
     ((0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, _CAMERA_HEIGHT), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
 )
+_CAMERAS = {"image": CAMERA, "rectified": CAMERA}  # as KITTI has them: the picture, and the frame of its labels
 
 
 class SyntheticDataset(Dataset):
@@ -87,7 +88,7 @@ class SyntheticDataset(Dataset):
     def meta(self, index: int) -> FrameMeta:
         number, step = divmod(range(self.frames)[index], self.sequence_length)
         name = f"{self.split}_{number:04d}"
-        return FrameMeta(f"{name}_{step:03d}", name, step, step * scene.PERIOD, {"image": CAMERA})
+        return FrameMeta(f"{name}_{step:03d}", name, step, step * scene.PERIOD, dict(_CAMERAS))
 
     def sequences(self) -> list[Sequence[int]]:
         starts = range(0, self.frames, self.sequence_length)

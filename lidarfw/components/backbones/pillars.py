@@ -59,6 +59,8 @@ class PillarsBackbone(Backbone):
     The paper's 2D network is the neck `bev_fpn`.
     """
 
+    example = {"lower": (0.0, -16.0, -3.0), "upper": (32.0, 16.0, 1.0)}
+
     def __init__(
         self,
         points: Spec,

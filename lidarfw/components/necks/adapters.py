@@ -54,6 +54,8 @@ class PointsToVoxels(Neck):
 class PointsToBEV(Neck):
     """A pillar feature net (PointPillars, CVPR 2019) on points that already carry features."""
 
+    example = {"lower": (0.0, -16.0, -3.0), "upper": (32.0, 16.0, 1.0)}
+
     def __init__(
         self,
         points: Spec,

@@ -24,6 +24,8 @@ class Lift(Neck):
     sees, 0 where it sees none.
     """
 
+    example = {"lower": (0.0, -16.0, -3.0), "upper": (32.0, 16.0, 1.0)}
+
     def __init__(
         self,
         images: list[Spec],

@@ -21,6 +21,8 @@ class Crop(Transform):
     crops points alone, in evaluation too.
     """
 
+    example = {"lower": (0.0, -40.0, -3.0), "upper": (70.4, 40.0, 1.0)}
+
     def __init__(
         self,
         *,
