@@ -210,9 +210,9 @@ def _unknown_component(slot: str, name: str, options: list[str]) -> LidarfwError
         registry.find(slot, name)
     except LidarfwError as error:
         presets = sorted(set(options) - set(registry.names(slot)))
-        text = f"\n  presets: {', '.join(presets)}" if presets else ""
-        near = "" if "did you mean" in str(error) else registry.did_you_mean(name, presets)
-        return type(error)(f"{error}{text}{near}")
+        text, mark, near = str(error).partition("\n  did you mean")
+        text += f"\n  presets: {', '.join(presets)}" if presets else ""
+        return type(error)(text + mark + near if near else text + registry.did_you_mean(name, presets))
     return ConfigError(f"{slot} {name!r} could not be loaded")
 
 
@@ -225,6 +225,7 @@ def _override_error(error: HydraException) -> str:
     slot, _, rest = key.partition(".")
     name, _, option = rest.partition(".")
     if slot not in SLOTS or not name:
+        reason = f"there is no config key {key!r}." if "not in struct" in reason else reason
         return f"{reason}{registry.did_you_mean(slot, [*SLOTS, *_top_keys()])}"
     if name not in registry.names(slot):
         near = registry.did_you_mean(name, registry.names(slot))

@@ -47,17 +47,15 @@ def _hydra(arguments: list[str]) -> int:
 
         try:
             return train(cfg)
-        except LidarfwError as error:
+        except LidarfwError as error:  # Hydra would print a trace; the other jobs of a sweep go on
             failed.append(error)
-            raise
+            return None
 
     sys.argv = [argv[0], *arguments]
     try:
         hydra.main(config_path="pkg://lidarfw.conf", config_name="train", version_base="1.3")(task)()
-    except SystemExit:
-        if failed:
-            raise failed[-1] from None
-        raise
     finally:
         sys.argv = argv
+    if failed:
+        raise failed[-1]
     return 0
