@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import signal
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,10 +14,11 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers.logger import Logger
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_only
+from lightning.pytorch.utilities import rank_zero_only
 
 from lidarfw.files import atomic_path
 
+log = logging.getLogger(__name__)
 TERMINATED = 143  # exit code of a process that ended on SIGTERM: 128 + 15
 
 
@@ -24,7 +26,7 @@ class Checkpoints(Checkpoint):
     """Writes `checkpoints/last.ckpt` and `checkpoints/best.ckpt` of a run.
 
     last.ckpt: every `every_n_steps` optimizer steps, before every validation, and at the end. It is only written
-    where no gradient is waiting to be accumulated further, so a resumed run is equal bit for bit to an uninterrupted one.
+    where no gradient waits to be accumulated further, so a resumed run equals an uninterrupted one bit for bit.
     best.ckpt: after every validation whose `monitor` figure is the best so far. Higher is better for `mode: max`.
     """
 
@@ -50,8 +52,8 @@ class Checkpoints(Checkpoint):
         self.saved_at = trainer.global_step
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
-        """Save every n steps. The last batch of an epoch is left to the validation and epoch end that follow."""
-        if self._due(trainer) and not pending_gradients(trainer) and not trainer.is_last_batch:
+        """Save every n steps."""
+        if self._due(trainer) and not pending_gradients(trainer) and not validation_follows(trainer):
             self.save_last(trainer)
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -69,18 +71,18 @@ class Checkpoints(Checkpoint):
         value = float(figure)
         if self.best is None or self.sign * value > self.sign * self.best:
             self.best = value
-            trainer.save_checkpoint(self.folder / "best.ckpt")
+            trainer.save_checkpoint(self.folder / "best.ckpt", weights_only=False)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save where it is due, and after the last epoch."""
-        if self._due(trainer) or _ends(trainer):
+        """Save after the last epoch."""
+        if _ends(trainer):
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
         """Write last.ckpt now."""
         self.saved_at = trainer.global_step
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
-            trainer.save_checkpoint(self.folder / "last.ckpt")
+            trainer.save_checkpoint(self.folder / "last.ckpt", weights_only=False)
 
     def _due(self, trainer: pl.Trainer) -> bool:
         return trainer.global_step - self.saved_at >= self.every_n_steps
@@ -94,8 +96,10 @@ class Checkpoints(Checkpoint):
         if state_dict["monitor"] == self.monitor:
             self.best = state_dict["best"]
 
-    def on_save_checkpoint(self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Before a validation, note in Lightning's loop state that it is still to run: as one that had begun batch 0."""
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Before a validation, note in Lightning's loop state that it is to run: as if its first batch had begun."""
         if not self._before_validation:
             return
         progress = checkpoint["loops"]["fit_loop"]["epoch_loop.val_loop.batch_progress"]
@@ -138,21 +142,14 @@ class Termination(Checkpoint):
         self._training = True
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
-        """Save and end, all processes at the same step. A validation that follows saves by itself."""
-        if pending_gradients(trainer) or trainer.is_last_batch or not self._asked(trainer):
-            return
-        self._save(trainer)
-        raise SystemExit(TERMINATED)
+        """Save and end, all processes at the same step. Before a validation, that saves by itself."""
+        if not pending_gradients(trainer) and not validation_follows(trainer) and self._asked(trainer):
+            self._save(trainer)
+            raise SystemExit(TERMINATED)
 
     def on_validation_batch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:
         """End: last.ckpt was written right before the validation."""
         if self.requested:
-            raise SystemExit(TERMINATED)
-
-    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Save and end."""
-        if self._asked(trainer) and not _ends(trainer):
-            self._save(trainer)
             raise SystemExit(TERMINATED)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -168,12 +165,18 @@ class Termination(Checkpoint):
         for callback in trainer.checkpoint_callbacks:
             if isinstance(callback, Checkpoints):
                 callback.save_last(trainer)
-                rank_zero_info(f"SIGTERM: saved {callback.folder / 'last.ckpt'}; go on with resume=auto")
+                log.warning("SIGTERM: saved %s; go on with resume=auto", callback.folder / "last.ckpt")
 
 
 def pending_gradients(trainer: pl.Trainer) -> bool:
     """Whether gradients of earlier batches wait for more (accumulate_grad_batches)."""
     return trainer.fit_loop._should_accumulate()
+
+
+def validation_follows(trainer: pl.Trainer) -> bool:
+    """Whether a validation comes after the batch that has just been trained on."""
+    fetcher = trainer.fit_loop._data_fetcher
+    return fetcher is not None and trainer.fit_loop.epoch_loop._should_check_val_fx(fetcher)
 
 
 def _in_training(trainer: pl.Trainer) -> bool:

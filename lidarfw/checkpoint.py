@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import logging
-import math
 import shutil
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -187,10 +186,13 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             kept = f"the one before it is still there: {path}" if path.exists() else "nothing stands there"
             reason = str(error).splitlines()[0]
             raise CheckpointError(
-                f"checkpoint {path} could not be written: {reason}\n  {kept}\n  fix: free space or rights in {path.parent}"
+                f"checkpoint {path} could not be written: {reason}\n  {kept}\n"
+                f"  fix: free space or rights in {path.parent}"
             ) from error
 
-    def load_checkpoint(self, path: str | Path, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
+    def load_checkpoint(
+        self, path: str | Path, map_location: Any = None, weights_only: bool | None = True
+    ) -> dict[str, Any]:
         """Read a checkpoint; its tensors go to the CPU first."""
         return read(path)
 
@@ -242,12 +244,17 @@ def model_of(content: Mapping[str, Any], about: Mapping[str, Any], path: str | P
         raise CheckpointError(f"{path}: its model cannot be built here: {error}") from error
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(f"{path}: its description is damaged: {type(error).__name__}: {error}") from error
+    restore(model, content, path)
+    return model.eval()
+
+
+def restore(model: nn.Module, content: Mapping[str, Any], path: str | Path) -> None:
+    """Load all weights of a checkpoint that was read already; CheckpointError unless every one fits."""
     weights = weights_of(content, path)
     report = compare(model, weights)
     if report.missing or report.skipped or report.mismatched:
-        raise CheckpointError(f"{path}: its weights do not fit the model of its own config.\n{report}")
+        raise CheckpointError(f"{path}: its weights do not fit the model of its config.\n{report}")
     model.load_state_dict(weights)
-    return model.eval()
 
 
 def weights_of(content: Mapping[str, Any], path: str | Path) -> dict[str, Tensor]:
@@ -326,8 +333,3 @@ def initialise(model: nn.Module, source: str | Path, only: Sequence[str] = ()) -
         raise ConfigError(f"init.from: no weight of {source} fits this model.\n{report}\n  it has: {', '.join(parts)}")
     model.load_state_dict({name: weights[name] for name in report.loaded}, strict=False)
     return report
-
-
-def is_finite(state: Mapping[str, Any]) -> bool:
-    """Whether all weights of a state dict are finite."""
-    return all(math.isfinite(float(value.sum())) for value in state.values() if value.is_floating_point())

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import lightning.pytorch as pl
 import numpy as np
 import torch
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_warn
 from torch.utils.data import DataLoader, get_worker_info
 
 from lidarfw.errors import CheckpointError, ConfigError, DataError, LidarfwError
@@ -182,10 +182,7 @@ class BatchOrder:
 
 
 class FrameLoader(DataLoader[Batch]):
-    """A DataLoader that goes on in the middle of an epoch, names the frames that fail, and never waits for ever.
-
-    Lightning stores its `state_dict` in every checkpoint and gives it back on resume.
-    """
+    """A DataLoader that goes on in the middle of an epoch, names the frames that fail, and never waits for ever."""
 
     def __init__(
         self, dataset: Clips, order: BatchOrder, *, workers: int = 0, timeout: float = 120, skip: bool = False
@@ -195,7 +192,7 @@ class FrameLoader(DataLoader[Batch]):
             batch_sampler=order,  # type: ignore[arg-type]
             num_workers=workers,
             timeout=timeout if workers else 0,
-            collate_fn=collate_clips,
+            collate_fn=collate_clips,  # type: ignore[arg-type]
             persistent_workers=workers > 0,
             pin_memory=torch.cuda.is_available(),
         )
@@ -216,7 +213,7 @@ class FrameLoader(DataLoader[Batch]):
             if state[key] != here:
                 raise CheckpointError(
                     f"cannot resume: the checkpoint was written with {key} = {state[key]}, this run has {here}.\n"
-                    "  loader.batch_size, loader.clip, seed, the dataset and the number of processes must stay the same\n"
+                    "  loader.batch_size, loader.clip, seed, dataset and number of processes must stay the same\n"
                     "  fix: start a new run from its weights, init.from=PATH"
                 )
         self.resume = (state["epoch"], state["position"])
@@ -320,6 +317,8 @@ class DataModule(pl.LightningDataModule):
         if bad_sample not in BAD_SAMPLE_POLICIES:
             raise ConfigError(f"loader.bad_sample is {bad_sample!r}; use one of: {', '.join(BAD_SAMPLE_POLICIES)}")
         self.skip = bad_sample == "skip"
+        self._train_loader: FrameLoader | None = None
+        self._resume: dict[str, int] | None = None
 
     @classmethod
     def from_config(cls, config: DictConfig) -> DataModule:
@@ -349,11 +348,24 @@ class DataModule(pl.LightningDataModule):
         if not clips:
             longest = max((len(s) for s in dataset.sequences()), default=0)
             raise ConfigError(f"loader.clip is {self.clip}, but the longest sequence has {longest} frames")
-        shuffle = not (self.trainer and self.trainer.overfit_batches)
+        shuffle = not getattr(self.trainer, "overfit_batches", 0)
         order = BatchOrder(
             len(clips), self.batch_size, seed=self.seed, shuffle=shuffle, rank=self.rank, world=self.world
         )
-        return self._loader(Clips(dataset, self.transforms["train"], clips, self.seed, replace=self.skip), order)
+        loader = self._loader(Clips(dataset, self.transforms["train"], clips, self.seed, replace=self.skip), order)
+        if self._resume is not None:
+            loader.load_state_dict(self._resume)
+        self._resume, self._train_loader = None, loader
+        return loader
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the training data stands; part of every checkpoint."""
+        return {"train": self._train_loader.state_dict()} if self._train_loader is not None else {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Let the next training loader go on there. Lightning's own way comes too late where the length of the run
+        is asked for (by a scheduler, say) before the loops are restored."""
+        self._resume = state_dict.get("train")
 
     def val_dataloader(self) -> FrameLoader:
         """The val split in whole sequences."""
@@ -378,7 +390,6 @@ class DataModule(pl.LightningDataModule):
         dataset = self.datasets[stage]
         if not len(dataset):
             raise DataError(f"split {dataset.split!r} of {type(dataset).__name__} has no frames")
-        rank_zero_info(f"{stage}: {len(dataset)} frames of split {dataset.split!r}")
         return dataset
 
     @property

@@ -6,7 +6,8 @@ import fnmatch
 import inspect
 import logging
 import math
-import sys
+import os
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,24 +16,26 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 import yaml
-from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
-from omegaconf import DictConfig, OmegaConf
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import ModelSummary, ProgressBar
+from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
+from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from lidarfw import checkpoint
 from lidarfw.callbacks import Termination
-from lidarfw.config import compose, instantiate, to_plain
+from lidarfw.config import instantiate, to_plain
 from lidarfw.data import DataModule
-from lidarfw.errors import CheckpointError, ConfigError, LidarfwError, TrainingError
+from lidarfw.errors import CheckpointError, ConfigError, TrainingError
+from lidarfw.evaluation import evaluation_config
 from lidarfw.files import write_text
-from lidarfw.types import Batch, FrameResult
+from lidarfw.types import Batch, DataSpec, FrameResult
 
 if TYPE_CHECKING:
     from lidarfw.model import PerceptionModel
 
-MODEL_KEYS = ("backbone", "neck", "head", "loss", "postprocessor", "filter", "tracker", "retriever", "balance")
-TRAINING_KEYS = ("optimizer", "scheduler", "init", "resume")  # of no use in an evaluation
 log = logging.getLogger(__name__)
+_say = rank_zero_only(log.info)
 
 
 class UncertaintyBalance(nn.Module):
@@ -79,12 +82,15 @@ class PerceptionModule(pl.LightningModule):
         if balance not in ("fixed", "uncertainty"):
             raise ConfigError(f"balance is {balance!r}; use fixed or uncertainty")
         self.model = model
-        self.balance = UncertaintyBalance(model.loss) if balance == "uncertainty" else None
+        self.balance = (
+            UncertaintyBalance(step.name for step in model.plan.of("loss")) if balance == "uncertainty" else None
+        )
         self.optimizer_node = dict(optimizer)
         self.scheduler_node = dict(scheduler or {})
         self.about = dict(about or {})
         self.seed = seed
         self.sample_ids: list[str] = []  # of the batch at hand, for messages
+        self.figures: dict[str, float] = {}  # of the last validation
         self._stream: Any = None
 
     @property
@@ -121,15 +127,15 @@ class PerceptionModule(pl.LightningModule):
             raise TrainingError("there is no loss to train on.\n  fix: select a loss, and give one a weight above 0")
         finite = torch.isfinite(torch.stack([value.detach().float() for value in terms.values()]))
         if not bool(finite.all()):
-            bad = [f"{name} is {float(terms[name]):g}" for name, ok in zip(terms, finite.tolist(), strict=True) if not ok]
-            raise self._not_finite(f"loss {', '.join(bad)}")
+            bad = [name for name, ok in zip(terms, finite.tolist(), strict=True) if not ok]
+            raise self._not_finite("loss " + ", ".join(f"{name} is {float(terms[name]):g}" for name in bad))
 
     def _not_finite(self, what: str) -> TrainingError:
         return TrainingError(
             f"{what} at step {self.global_step} (epoch {self.current_epoch}), samples {', '.join(self.sample_ids)}.\n"
             "  training stopped before the optimizer step: the weights are those of the step before, still finite\n"
-            "  fix: look at these samples, lower optimizer.lr, set trainer.gradient_clip_val, or trainer.precision=32-true;"
-            "\n  trainer.detect_anomaly=true names the operation"
+            "  fix: look at these samples, lower optimizer.lr, lower trainer.gradient_clip_val, or\n"
+            "  trainer.precision=32-true; trainer.detect_anomaly=true names the operation"
         )
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
@@ -144,7 +150,7 @@ class PerceptionModule(pl.LightningModule):
             raise self._not_finite(f"the gradient of {bad[0]} and {len(bad) - 1} other weights is not finite")
 
     def _log_losses(self, losses: Mapping[str, Mapping[str, Tensor]], total: Tensor, size: int) -> None:
-        terms = {f"loss/{name}/{term}": value.detach() for name, values in losses.items() for term, value in values.items()}
+        terms = {f"loss/{name}/{term}": v.detach() for name, values in losses.items() for term, v in values.items()}
         if self.balance:
             terms |= {f"balance/{name}": weight for name, weight in self.balance.weights().items()}
         terms["learning_rate"] = torch.tensor(self.trainer.optimizers[0].param_groups[0]["lr"])
@@ -178,9 +184,9 @@ class PerceptionModule(pl.LightningModule):
         if self._stream is not None:
             self.model.update_metrics(self._stream.flush())
         figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
-        self.log_dict(figures, sync_dist=True, prog_bar=False)
-        if self.monitor in figures:
-            self.log(f"{stage}_monitor", figures[str(self.monitor)], sync_dist=True, prog_bar=True, logger=False)
+        self.log_dict(figures, sync_dist=True)
+        if not self.trainer.sanity_checking:
+            self.figures = figures
 
     test_step = validation_step
     on_test_epoch_start = on_validation_epoch_start
@@ -214,8 +220,12 @@ class PerceptionModule(pl.LightningModule):
         return {"scheduler": scheduler, "interval": interval, "monitor": self.monitor, "strict": False}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add the description."""
-        checkpoint["lidarfw"] = self.about
+        """Add the description and the figures of the last validation."""
+        checkpoint["lidarfw"] = {**self.about, "figures": self.figures}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Know the figures of a validation before the interruption."""
+        self.figures = dict(checkpoint.get("lidarfw", {}).get("figures", {}))
 
 
 def parameter_groups(named: Iterable[tuple[str, nn.Parameter]], groups: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -232,7 +242,8 @@ def parameter_groups(named: Iterable[tuple[str, nn.Parameter]], groups: Mapping[
         if not found[pattern]:
             parts = sorted({".".join(name.split(".")[:2]) for name in parameters})
             raise ConfigError(
-                f"optimizer.groups: no weight fits {pattern!r} (that no earlier pattern has).\n  there are: {', '.join(parts)}"
+                f"optimizer.groups: no weight fits {pattern!r} (that no earlier pattern has).\n"
+                f"  there are: {', '.join(parts)}"
             )
     return [{"params": members, **(groups.get(pattern) or {})} for pattern, members in found.items() if members]
 
@@ -245,9 +256,9 @@ def _call(key: str, factory: Any, *args: Any, **kwargs: Any) -> Any:
     try:
         return factory(*args, **kwargs)
     except (TypeError, ValueError) as error:
-        accepted = ", ".join(name for name in inspect.signature(factory.func).parameters if name not in ("self", "params"))
-        raise ConfigError(f"{key}: {factory.func.__name__}: {error}\n  its options: {accepted}") from error
-    except pl.utilities.exceptions.MisconfigurationException as error:
+        options = ", ".join(inspect.signature(factory.func).parameters)
+        raise ConfigError(f"{key}: {factory.func.__name__}: {error}\n  it takes: {options}") from error
+    except MisconfigurationException as error:
         raise ConfigError(f"{key}: {error}") from error
 
 
@@ -261,6 +272,7 @@ def train(config: DictConfig) -> dict[str, float]:
     """
     from lidarfw.assembly import build, plan
 
+    _quieten()
     stop = Termination()
     stop.install()
     try:
@@ -281,6 +293,13 @@ def train(config: DictConfig) -> dict[str, float]:
         stop.uninstall()
 
 
+def _quieten() -> None:
+    """Leave out what Lightning says on every run and no user of lidarfw can act on."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
+    for text in (".*LeafSpec.*", ".*does not have many workers.*", ".*smaller than the logging interval.*"):
+        warnings.filterwarnings("ignore", message=text)
+
+
 def _module(model: PerceptionModel, config: Mapping[str, Any], about: Mapping[str, Any]) -> PerceptionModule:
     keys = ("optimizer", "scheduler", "balance", "seed")
     return PerceptionModule(model, about=about, **{key: config[key] for key in keys})
@@ -293,7 +312,7 @@ def _initialise(model: PerceptionModel, node: Any) -> None:
     if unknown or not node.get("from"):
         raise ConfigError("init takes {from: model.ckpt, only: [backbone.NAME]}" + f", not {unknown}" * bool(unknown))
     report = checkpoint.initialise(model, node["from"], list(node.get("only") or ()))
-    rank_zero_info(f"weights of {node['from']}:\n{report}")
+    _say(f"weights of {node['from']}:\n{report}")
 
 
 def _fit(trainer: pl.Trainer, module: PerceptionModule, data: DataModule, resume: Path | None) -> dict[str, float]:
@@ -301,9 +320,9 @@ def _fit(trainer: pl.Trainer, module: PerceptionModule, data: DataModule, resume
         trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except (torch.OutOfMemoryError, MemoryError) as error:
         raise _out_of_memory(error, module) from error
-    except pl.utilities.exceptions.MisconfigurationException as error:
+    except MisconfigurationException as error:
         raise ConfigError(f"trainer: {error}") from error
-    return {name: float(value) for name, value in trainer.callback_metrics.items()}
+    return {**module.figures, **{name: float(value) for name, value in trainer.callback_metrics.items()}}
 
 
 def _out_of_memory(error: BaseException, module: PerceptionModule) -> TrainingError:
@@ -334,7 +353,7 @@ def _resume_from(resume: str | None, folder: Path) -> Path | None:
         checkpoint.verify(resume)
         return Path(resume)
     if not last.exists():
-        rank_zero_info(f"resume=auto: no {last} yet, starting anew")
+        _say(f"resume=auto: no {last} yet, starting anew")
         return None
     return last
 
@@ -344,11 +363,16 @@ def make_trainer(
 ) -> pl.Trainer:
     """The Lightning trainer of a config, with its loggers and callbacks."""
     node = to_plain(config.trainer)
+    if any("SLURM" in str(plugin) for plugin in node.get("plugins") or ()) and "SLURM_NTASKS" not in os.environ:
+        raise ConfigError("trainer=slurm runs inside a Slurm job only.\n  fix: srun lidarfw train ..., or trainer=ddp")
     loggers = [_logger(n, folder) for n in _nodes(config.logger)]
-    options = {
+    listed = [_build("callbacks", n) for n in _nodes(config.callbacks)]
+    for key, kind in (("enable_progress_bar", ProgressBar), ("enable_model_summary", ModelSummary)):
+        listed = [callback for callback in listed if node.get(key, True) or not isinstance(callback, kind)]
+    options: dict[str, Any] = {
         "default_root_dir": str(folder),
         "logger": loggers or False,
-        "callbacks": [*(_build("callbacks", n) for n in _nodes(config.callbacks)), *callbacks],
+        "callbacks": [*listed, *callbacks],
         "plugins": [*(instantiate(n) for n in node.pop("plugins", None) or ()), checkpoint.AtomicCheckpointIO()],
         "use_distributed_sampler": False,  # the data module divides the frames itself
     }
@@ -383,78 +407,31 @@ def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float
     """
     from lidarfw.assembly import build, plan
 
+    _quieten()
     content = checkpoint.read(path)
     about = checkpoint.description(content, path)
     config = evaluation_config(checkpoint.config_of(about, path), overrides)
-    model = checkpoint.model_of(content, about, path)
     wired = plan(config)
-    _check_same_data(model.plan.data, wired.data, path)
-    measured = build(wired)
-    measured.load_state_dict(model.state_dict())
-    module = _module(measured, to_plain(config), about)
-    data = DataModule.from_config(config)
-    trainer = make_trainer(config, Path(path).parent, validate=False)
-    trainer.test(module, datamodule=data, verbose=False)
-    return {name.removeprefix("test/"): float(v) for name, v in trainer.callback_metrics.items() if name.startswith("test/")}
-
-
-def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
-    """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise ConfigError(f"cannot read the overrides: {error}") from error
-    for override in parsed:
-        _refuse_model_key(override.key_or_group, override.input_line or "")
-    groups = [o for o in parsed if "." not in o.key_or_group and isinstance(stored.get(o.key_or_group), (dict, type(None)))]
-    composed = compose([str(o.input_line) for o in groups])
-    config = OmegaConf.create({**stored, "callbacks": None, "logger": None, "resume": None, "init": None})
-    for override in groups:
-        config[override.key_or_group] = composed[override.key_or_group]
-    for override in parsed:
-        if override not in groups:
-            _set(config, override)
-    return config
-
-
-def _refuse_model_key(key: str, line: str) -> None:
-    root = key.partition(".")[0].partition("@")[0]
-    if root in MODEL_KEYS:
-        raise ConfigError(
-            f"{line}: {root} is part of the model, and the model comes from the checkpoint with its weights.\n"
-            f"  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed\n  fix: train with {line}"
-        )
-    if root in TRAINING_KEYS:
-        raise ConfigError(f"{line}: an evaluation does not train, {root} has no effect.\n  fix: leave it out")
-
-
-def _set(config: DictConfig, override: Any) -> None:
-    key = override.key_or_group
-    if override.is_delete():
-        parent, _, name = key.rpartition(".")
-        OmegaConf.select(config, parent).pop(name) if parent else config.pop(name)
-        return
-    parent = key.rpartition(".")[0]
-    there = OmegaConf.select(config, parent) if parent else config
-    if there is None or (not override.is_add() and not override.is_force_add() and key.rpartition(".")[2] not in there):
-        known = ", ".join(str(k) for k in (there if there is not None else config))
-        raise ConfigError(f"{override.input_line}: there is no {key!r} in the config of the checkpoint.\n  there is: {known}")
-    OmegaConf.update(config, key, override.value(), force_add=True)
+    _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
+    pl.seed_everything(config.seed, verbose=False)
+    model = build(wired)
+    checkpoint.restore(model, content, path)
+    trainer = make_trainer(config, Path(path).parent)
+    trainer.test(_module(model, to_plain(config), about), datamodule=DataModule.from_config(config), verbose=False)
+    return {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()}
 
 
 def _check_same_data(learned: Any, offered: Any, path: str | Path) -> None:
     if learned.classes != offered.classes:
         raise CheckpointError(
-            f"{path} was trained on the classes {', '.join(learned.classes)}, this dataset has {', '.join(offered.classes)}."
-            "\n  fix: give the dataset the same classes in the same order"
+            f"{path} was trained on the classes {', '.join(learned.classes)}, "
+            f"this dataset has {', '.join(offered.classes)}.\n  fix: give the dataset the same, in the same order"
         )
     for name, spec in learned.inputs.items():
         there = offered.inputs.get(name)
         if there is None or (there.kind, there.channels) != (spec.kind, spec.channels):
-            raise CheckpointError(f"{path} was trained on {name}: {spec}, this dataset gives {there or 'no such input'}")
+            given = there or "no such input"
+            raise CheckpointError(f"{path} was trained on {name}: {spec}, this dataset gives {given}")
 
 
-__all__ = ["LidarfwError", "PerceptionModule", "UncertaintyBalance", "evaluate", "make_trainer", "train"]
+__all__ = ["PerceptionModule", "UncertaintyBalance", "evaluate", "make_trainer", "train"]
