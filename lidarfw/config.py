@@ -226,6 +226,8 @@ def _override_error(error: HydraException) -> str:
     name, _, option = rest.partition(".")
     if slot not in SLOTS or not name:
         reason = f"there is no config key {key!r}." if "not in struct" in reason else reason
+        if slot in _top_keys():
+            return f"{reason}\n  `lidarfw train --cfg job` shows all keys; +{key}=VALUE adds one"
         return f"{reason}{registry.did_you_mean(slot, [*SLOTS, *_top_keys()])}"
     if name not in registry.names(slot):
         near = registry.did_you_mean(name, registry.names(slot))
