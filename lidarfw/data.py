@@ -331,9 +331,11 @@ class DataModule(pl.LightningDataModule):
         return cls(datasets, transforms, seed=config.seed, **config.loader)
 
     def prepare_data(self) -> None:
-        """Let the datasets get their files ready; Lightning calls this on one process per node."""
-        for dataset in self.datasets.values():
+        """Let datasets and transforms get their files ready; Lightning calls this on one process per node."""
+        for name, dataset in self.datasets.items():
             dataset.prepare()
+            for transform in self.transforms[name]:
+                transform.prepare(dataset, max(self.workers, 1))
 
     def setup(self, stage: str) -> None:
         """Tell the transforms which dataset they work on."""

@@ -1,4 +1,4 @@
-"""`lidarfw prepare`: what has to be read or written once before training."""
+"""`lidarfw prepare`: what has to be checked or written once before training, which else does it itself."""
 
 from __future__ import annotations
 

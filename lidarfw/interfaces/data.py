@@ -60,7 +60,10 @@ class Transform(ABC):
         return data
 
     def prepare(self, dataset: Dataset, workers: int = 1) -> None:
-        """Write the files that the transform needs of the whole dataset. Done by `lidarfw prepare`, not by training."""
+        """Write what the transform needs of the whole dataset, unless it stands already.
+
+        Called on one process before training, and by `lidarfw prepare`, with as many `workers` as it may start.
+        """
 
     def attach(self, dataset: Dataset) -> None:
         """Told once which dataset the frames come from, after `prepare` and before the first call."""
