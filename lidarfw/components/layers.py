@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -11,35 +12,42 @@ from lidarfw.errors import ConfigError, GeometryError
 from lidarfw.types import Grid
 
 
-def _normalize(norm: nn.BatchNorm1d | nn.BatchNorm2d, values: Tensor) -> Tensor:
-    """Normalise with the running statistics, which stay as they are."""
-    return F.batch_norm(values, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
+class _BatchNorm(nn.modules.batchnorm._BatchNorm):
+    """What both batch normalisations share.
+
+    LiDAR networks average their running statistics over about 100 batches (momentum 0.01). From the first batch on
+    that leaves the initial values in for hundreds of steps, and a network that has learned fails in evaluation. So
+    the n-th batch weighs 10 / (n + 10) until that falls to 0.01: an average over the last tenth of the training, as
+    Shamir and Zhang (ICML 2013, section 4) give it for weights.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(channels, eps=1e-3, momentum=0.01)
+        self._batches: int | None = None  # num_batches_tracked as a number: reading the tensor would wait for the GPU
+
+    def forward(self, input: Tensor) -> Tensor:
+        if input.numel() <= self.num_features:  # no variance: normalise by the running statistics, leave them alone
+            return F.batch_norm(input, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+        if self.training:
+            seen = int(self.num_batches_tracked or 0) if self._batches is None else self._batches
+            self._batches, self.momentum = seen + 1, max(0.01, 10 / (seen + 10))
+        return super().forward(input)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self._batches = None
+        super()._load_from_state_dict(*args, **kwargs)
 
 
-class BatchNorm1d(nn.BatchNorm1d):
-    """Batch normalisation of rows (N, C), eps 1e-3 and momentum 0.01 as LiDAR networks use it.
+class BatchNorm1d(_BatchNorm, nn.BatchNorm1d):
+    """Batch normalisation of rows (N, C), eps 1e-3 and a final momentum of 0.01 as LiDAR networks use it.
 
     In training, zero rows or one have no variance to normalise with (torch raises an error for one row): they are
     normalised by the running statistics, as in evaluation, and do not change them.
     """
 
-    def __init__(self, channels: int) -> None:
-        super().__init__(channels, eps=1e-3, momentum=0.01)
 
-    def forward(self, input: Tensor) -> Tensor:
-        """(N, C) -> (N, C)."""
-        return _normalize(self, input) if input.numel() <= self.num_features else super().forward(input)
-
-
-class BatchNorm2d(nn.BatchNorm2d):
-    """Batch normalisation of maps (B, C, H, W), eps 1e-3 and momentum 0.01; a single value is treated as above."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__(channels, eps=1e-3, momentum=0.01)
-
-    def forward(self, input: Tensor) -> Tensor:
-        """(B, C, H, W) -> (B, C, H, W)."""
-        return _normalize(self, input) if input.numel() <= self.num_features else super().forward(input)
+class BatchNorm2d(_BatchNorm, nn.BatchNorm2d):
+    """Batch normalisation of maps (B, C, H, W) in the same way; a single value is treated as one row is there."""
 
 
 def conv_block(in_channels: int, channels: int, stride: int = 1) -> nn.Sequential:
