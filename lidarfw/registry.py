@@ -172,6 +172,12 @@ def declared_by(project: Path) -> dict[str, dict[str, str]]:
     return {group.removeprefix("lidarfw."): value for group, value in points.items() if group.startswith("lidarfw.")}
 
 
+def project_name(project: Path) -> str:
+    """Name of the distribution that a project's pyproject.toml builds."""
+    text = (project / "pyproject.toml").read_text(encoding="utf-8")
+    return str(tomllib.loads(text).get("project", {}).get("name", ""))
+
+
 def stale_metadata() -> list[str]:
     """One message for every editable distribution whose pyproject and installed metadata differ."""
     messages = []

@@ -125,6 +125,12 @@ def test_scatter_of_nothing_stays_in_the_graph(scatter) -> None:
     assert torch.equal(outside.grad, torch.zeros(2, 3))
 
 
+@pytest.mark.parametrize("scatter", [scatter_sum, scatter_mean, scatter_max])
+def test_scatter_of_rows_that_all_lie_outside(scatter) -> None:
+    assert scatter(torch.rand(5, 3), torch.full((5,), -1), 0).shape == (0, 3)
+    assert torch.equal(scatter(torch.rand(5, 3), torch.full((5,), -1), 2), torch.zeros(2, 3))
+
+
 def test_voxel_mean_passes_gradients_to_point_features() -> None:
     points = cloud(30, 2, 5, torch.float64)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import os
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from lidarfw.interfaces import SLOTS
 from lidarfw.testing.checks.subject import SkippedError, require
 
 PACKAGE_CHECKS: list[Callable[[str], None]] = []
-_SHIPPED = (".py", ".yaml", ".js")
+_SHIPPED = (".py", ".yaml", ".js", ".template")
 
 
 def package_check(function: Callable[[str], None]) -> Callable[[str], None]:
@@ -59,7 +60,9 @@ def importing_needs_no_torch(distribution: str) -> None:
     """Importing the top package imports neither torch nor lightning."""
     for package in _top_packages(distribution):
         code = f"import sys, {package}; print(*(m for m in ('torch', 'lightning') if m in sys.modules))"
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        path = os.pathsep.join(filter(None, sys.path))  # a plugin may be on the path without being installed
+        environment = {**os.environ, "PYTHONPATH": path}
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
         require(done.returncode == 0, f"import {package} fails: {done.stderr.strip().splitlines()[-1:]}")
         require(not done.stdout.strip(), f"import {package} imports {done.stdout.strip()}")
 
