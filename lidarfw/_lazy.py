@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from types import ModuleType
 from typing import Any
 
@@ -11,7 +12,10 @@ class LazyModule(ModuleType):
     """Stands for the module `name` and imports it when one of its attributes is read."""
 
     def __getattr__(self, attribute: str) -> Any:
-        return getattr(importlib.import_module(self.__name__), attribute)
+        module = sys.modules.get(self.__name__) or importlib.import_module(
+            self.__name__
+        )  # the import alone takes 15 us
+        return getattr(module, attribute)
 
 
 def lazy_attributes(package: str, names: dict[str, str]) -> Any:
