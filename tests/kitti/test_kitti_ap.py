@@ -216,6 +216,23 @@ def test_batches_and_order_of_frames_do_not_matter():
     assert set(metric.compute().values()) == {0.0}
 
 
+def test_two_processes_make_one_metric():
+    """Frames counted apart and merged, as after an exchange between processes; one of them may have seen nothing."""
+    rng = np.random.default_rng(4)
+    frames = [random_frame(rng) for _ in range(9)]
+    parts = []
+    for share in (frames[:4], [], frames[4:]):
+        parts.append(KittiAP(SPEC))
+        for objects, detections in share:
+            found, _ = kitti.boxes_from_labels(detections, CALIBRATION, CLASSES)
+            boxes, ignored = kitti.boxes_from_labels(objects, CALIBRATION, CLASSES)
+            parts[-1].update(found, Targets(boxes=boxes, ignored=ignored), [META])
+    whole = KittiAP(SPEC)
+    for name in ("detections", "objects", "pairs", "frames"):
+        setattr(whole, name, torch.cat([torch.cat(getattr(part, name)) for part in parts]))
+    assert whole.compute() == pytest.approx(measure(frames), abs=1e-12)
+
+
 def test_projected_rectangle_stands_in_for_a_missing_one():
     frames = many(80)
     metric = KittiAP(SPEC)
