@@ -18,7 +18,7 @@ class _BatchNorm(nn.modules.batchnorm._BatchNorm):
     LiDAR networks average their running statistics over about 100 batches (momentum 0.01). From the first batch on
     that leaves the initial values in for hundreds of steps, and a network that has learned fails in evaluation. So
     the n-th batch weighs 10 / (n + 10) until that falls to 0.01: an average over the last tenth of the training, as
-    Shamir and Zhang (ICML 2013, section 4) give it for weights.
+    Shamir and Zhang (ICML 2013) give it for weights.
     """
 
     def __init__(self, channels: int) -> None:

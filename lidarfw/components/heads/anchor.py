@@ -42,7 +42,7 @@ def encode(boxes: Tensor, anchors: Tensor) -> Tensor:
     """Residuals (M, 7) that take anchors (M, 7) to boxes (M, 7).
 
     x, y over the anchor's diagonal, z over its height, log ratios of the sizes, difference of yaw
-    (SECOND, Yan et al., Sensors 2018, section 3.3).
+    (SECOND, Yan et al., Sensors 2018).
     """
     diagonal = anchors[:, 3:5].norm(dim=1, keepdim=True)
     scale = torch.cat([diagonal, diagonal, anchors[:, 5:6]], 1)

@@ -38,7 +38,7 @@ def match(iou: Tensor, matched: Tensor, unmatched: Tensor) -> Tensor:
 
 
 class AnchorLoss(Loss):
-    """Train the anchor head (SECOND, Yan et al., Sensors 2018, section 3.4; values of its KITTI configuration).
+    """Train the anchor head (SECOND, Yan et al., Sensors 2018; values of its KITTI configuration).
 
     An anchor is compared with the boxes of its own class by the IoU of their footprints turned to the nearest axis.
     Terms: `class` (focal loss over all classes, `alpha`, `gamma`), `box` (smooth L1 with `beta`, yaw by the sine of

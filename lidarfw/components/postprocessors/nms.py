@@ -61,7 +61,7 @@ class NMS(PostProcessor):
 class CircleNMS(PostProcessor):
     """Suppress boxes whose centre lies within a radius of a better box of the same frame and class.
 
-    For the maps of center heads (CenterPoint, Yin et al., CVPR 2021, section 4): cheaper than rotated NMS. `radius`
+    For the maps of center heads (CenterPoint, Yin et al., CVPR 2021): cheaper than rotated NMS. `radius`
     gives the radius in metres by class name, `default_radius` that of the others. The other options are those of
     `nms`. Raises ConfigError for a class that the data does not have.
     """

@@ -29,7 +29,7 @@ class GreedyState:
 
 
 class GreedyTracker(Tracker):
-    """Give each detection the identity of the nearest track (CenterPoint, Yin et al., CVPR 2021, section 4.1).
+    """Give each detection the identity of the nearest track (CenterPoint, Yin et al., CVPR 2021, section 4).
 
     Tracks are moved on to the time of the frame, with the velocity of their last detection where the detector gives
     one, else with their last displacement. Detections choose by falling score, each the nearest free track of its
