@@ -79,8 +79,10 @@ class Checkpoints(Checkpoint):
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
-        """Write last.ckpt now."""
+        """Write last.ckpt now, and what was logged so far."""
         self.saved_at = trainer.global_step
+        for logger in trainer.loggers:
+            logger.save()
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self.folder / "last.ckpt", weights_only=False)
 
@@ -133,12 +135,13 @@ class Termination(Checkpoint):
         if not self._training:
             raise SystemExit(TERMINATED)
 
-    def setup(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+    def on_sanity_check_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Lightning has just put its own handler in, which ends with exit code 0: put ours back."""
         signal.signal(signal.SIGTERM, self._receive)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """From here on there is something to save."""
+        signal.signal(signal.SIGTERM, self._receive)
         self._training = True
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:

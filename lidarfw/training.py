@@ -184,7 +184,8 @@ class PerceptionModule(pl.LightningModule):
         if self._stream is not None:
             self.model.update_metrics(self._stream.flush())
         figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
-        self.log_dict(figures, sync_dist=True)
+        for name, value in figures.items():
+            self.log(name, value, prog_bar=name == self.monitor, sync_dist=True)
         if not self.trainer.sanity_checking:
             self.figures = figures
 
