@@ -187,8 +187,9 @@ def _options(slot: str, name: str, node: Mapping[str, Any], declared: Declaratio
         near = registry.did_you_mean(unknown[0], list(declared.options))
         known = ", ".join(declared.options) or "none"
         raise ConfigError(f"{slot}.{name} has no option {unknown[0]!r}.\n  options of {node['type']!r}: {known}{near}")
+    given = {key: value for key, value in node.items() if key != "inputs"}  # those are checked when they are wired
     try:
-        typed = OmegaConf.merge(OmegaConf.structured(node_class(slot, node["type"])), dict(node))
+        typed = OmegaConf.merge(OmegaConf.structured(node_class(slot, node["type"])), given)
     except Exception as error:  # OmegaConf's validation errors share no base class with pickling and merge errors
         raise ConfigError(f"{slot}.{name}: {str(error).splitlines()[0]}") from error
     values: Any = OmegaConf.to_container(typed, resolve=True)
@@ -220,7 +221,7 @@ class _Planner:
         step = Step(slot, name, declared, _options(slot, name, node, declared))
         step.weight, step.ramp = float(node.get("weight", 1.0)), float(node.get("ramp", 0.0))
         step.default_of = bound.id if bound else ""
-        chosen = dict(node.get("inputs") or {})
+        chosen = {name: value for name, value in (node.get("inputs") or {}).items() if value is not None}
         self._check_inputs(step, chosen)
         for parameter in step.parameters:
             step.takes[parameter.name] = self._resolve(step, parameter, chosen.get(parameter.name), bound)
@@ -406,7 +407,7 @@ class _Planner:
         key = f"{step.id}.inputs"
         return (
             f"{step.id} could take {p} from {names}.\n  fix: write {key}: {{{p.name}: {found[-1].producer}}} "
-            f"(on the command line: '+{key}.{p.name}={found[-1].producer}')"
+            f"(on the command line: {key}.{p.name}={found[-1].producer})"
         )
 
 

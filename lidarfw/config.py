@@ -98,7 +98,9 @@ def register() -> None:
 def node_class(slot: str, name: str) -> type:
     """The dataclass of a component's config node: `type`, `inputs`, and its options with defaults and types."""
     declared = declaration.read(slot, name)
-    fields: list[Any] = [("type", str, name), ("inputs", dict[str, Any], dataclasses.field(default_factory=dict))]
+    parameters = [*declared.takes, *(declared.trainable or ())]
+    inputs = dataclasses.make_dataclass("inputs", [(n, Any, None) for n in dict.fromkeys(p.name for p in parameters)])
+    fields: list[Any] = [("type", str, name), ("inputs", inputs, dataclasses.field(default_factory=inputs))]
     if slot == "loss":
         fields += [("weight", float, 1.0), ("ramp", float, 0.0)]
     for option, (annotation, default) in ((n, (o.annotation, o.default)) for n, o in declared.options.items()):
@@ -232,9 +234,12 @@ def _override_error(error: HydraException) -> str:
     if name not in registry.names(slot):
         near = registry.did_you_mean(name, registry.names(slot))
         return f"{slot}.{name} is not selected, and no {slot} has that name.{near}"
-    options = [*RESERVED, *(LOSS_RESERVED if slot == "loss" else ()), *declaration.read(slot, name).options]
-    if option.partition(".")[0] in options and "could not be converted" not in reason and "merging" not in str(error):
+    declared = declaration.read(slot, name)
+    options = [*RESERVED, *(LOSS_RESERVED if slot == "loss" else ()), *declared.options]
+    if f"Key '{name}'" in reason:
         return f"{slot}.{name} has options but is not selected.\n  fix: add {slot}={name} (or {slot}=[...,{name}])"
+    if option.startswith("inputs."):
+        options = [f"inputs.{p.name}" for p in declared.takes]
     if option in options:
         return f"{key}: {reason}"
     near = registry.did_you_mean(option, options)
