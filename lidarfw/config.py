@@ -236,7 +236,7 @@ def _override_error(error: HydraException) -> str:
         return f"{slot}.{name} is not selected, and no {slot} has that name.{near}"
     declared = declaration.read(slot, name)
     options = [*RESERVED, *(LOSS_RESERVED if slot == "loss" else ()), *declared.options]
-    if f"Key '{name}'" in reason:
+    if re.search(rf"Key '({slot}|{name})'", reason):
         return f"{slot}.{name} has options but is not selected.\n  fix: add {slot}={name} (or {slot}=[...,{name}])"
     if option.startswith("inputs."):
         options = [f"inputs.{p.name}" for p in declared.takes]
