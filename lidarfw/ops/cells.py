@@ -150,9 +150,8 @@ def scatter_max(features: Tensor, inverse: Tensor, size: int) -> Tensor:
     keep = inverse >= 0
     features = torch.where(keep[:, None], features, -torch.inf)
     target = inverse.clamp(min=0)[:, None].expand(-1, features.shape[1])
-    empty = features.new_full(
-        (max(size, 1), features.shape[1]), -torch.inf
-    )  # ignored rows need a target even if size = 0
+    rows = max(size, 1)  # ignored rows need a target, even where every row is ignored
+    empty = features.new_full((rows, features.shape[1]), -torch.inf)
     highest = empty.scatter_reduce(0, target, features, "amax")[:size]
     return torch.where(torch.isneginf(highest), 0, highest)
 

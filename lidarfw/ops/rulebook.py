@@ -24,6 +24,7 @@ from lidarfw.types import Voxels
 Triple = tuple[int, int, int]
 
 _TABLE_CELLS = 2**24  # a dense lookup table of up to so many cells (64 MB) is faster than searching
+_BLOCK_PAIRS = 2**16
 _local = threading.local()
 
 
@@ -48,6 +49,21 @@ class Kernel:
 
 
 @dataclass
+class Block:
+    """A run of output rows and the pairs that reach them: what is computed at a time.
+
+    The products of a block stay in the processor's cache until they are summed, and its size bounds the
+    scratch memory, whatever the size of the scan.
+    """
+
+    rows: slice  # output rows
+    groups: list[tuple[Tensor, Tensor, int]]  # input rows, output rows and kernel element of a run of pairs
+    pairs: int
+    order: Tensor  # (pairs,) int32 pairs of the block sorted by output row
+    starts: Tensor  # (rows + 1,) int32: row r of the block owns order[starts[r]:starts[r + 1]]
+
+
+@dataclass
 class Rulebook:
     """Pairs of input and output rows, grouped by kernel element; each group ascends in both."""
 
@@ -57,41 +73,61 @@ class Rulebook:
     counts: tuple[int, ...]  # pairs in each group
     num_inputs: int
     num_outputs: int
-    symmetric: bool = False  # submanifold: the pairs of element k are those of its mirror image, swapped
-    volume: int = 0
-    order: Tensor | None = None  # (P,) int32 pairs sorted by output
-    starts: Tensor | None = None  # (num_outputs + 1,) int32: output r owns order[starts[r]:starts[r + 1]]
+    volume: int  # elements of the kernel
+    symmetric: bool = False  # submanifold: the pairs of an element are those of its mirror image, swapped
+    _blocks: list[Block] | None = field(default=None, repr=False)
     _transposed: Rulebook | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return int(self.inputs.shape[0])
 
-    def by_output(self) -> tuple[Tensor, Tensor]:
-        """`order` and `starts`, made at first use."""
-        if self.order is None or self.starts is None:
-            self.order = torch.sort(self.outputs, stable=True)[1].int()
-            self.starts = row_starts(torch.bincount(self.outputs, minlength=self.num_outputs)).int()
-        return self.order, self.starts
-
     def transposed(self) -> Rulebook:
         """The rulebook from outputs to inputs, for gradients and inverse convolution.
 
-        Of a submanifold convolution it holds the same pairs, under mirrored kernel elements.
+        That of a submanifold convolution holds the same pairs, under mirrored kernel elements.
         """
         if self._transposed is None:
+            sides, elements = (self.outputs, self.inputs), self.elements
             if self.symmetric:
-                mirrored = tuple(self.volume - 1 - e for e in self.elements)
-                self._transposed = Rulebook(
-                    self.inputs, self.outputs, mirrored, self.counts, self.num_inputs, self.num_outputs, True,
-                    self.volume, *self.by_output(),
-                )  # fmt: skip
-            else:
-                self._transposed = Rulebook(
-                    self.outputs, self.inputs, self.elements, self.counts, self.num_outputs, self.num_inputs,
-                    False, self.volume,
-                )  # fmt: skip
+                sides, elements = (self.inputs, self.outputs), tuple(self.volume - 1 - e for e in elements)
+            sizes = self.num_outputs, self.num_inputs
+            self._transposed = Rulebook(*sides, elements, self.counts, *sizes, self.volume, self.symmetric)
             self._transposed._transposed = self
         return self._transposed
+
+    def pairs_per_output(self) -> Tensor:
+        """(num_outputs,) int64."""
+        return torch.bincount(self.outputs, minlength=self.num_outputs)
+
+    def blocks(self) -> list[Block]:
+        """The blocks, made at first use: each of at most about `_BLOCK_PAIRS` pairs, covering all output rows."""
+        if self._blocks is None:
+            starts = row_starts(self.pairs_per_output())
+            number = len(self) // _BLOCK_PAIRS + 1
+            limits = torch.arange(number, device=starts.device) * _BLOCK_PAIRS
+            first_rows = torch.searchsorted(starts, limits)
+            bounds = self._bounds(first_rows).tolist()
+            rows = [*first_rows.tolist(), self.num_outputs]
+            self._blocks = [
+                self._block(slice(*rows[b : b + 2]), bounds[b], bounds[b + 1], starts) for b in range(number)
+            ]
+        return self._blocks
+
+    def _bounds(self, first_rows: Tensor) -> Tensor:
+        """(blocks + 1, groups) int64 pair at which each group's part of each block begins, and the groups' ends."""
+        sizes = torch.tensor(self.counts, dtype=torch.long, device=first_rows.device)
+        inside = sizes.repeat(len(first_rows) + 1, 1)
+        for column, group in enumerate(self.outputs.split_with_sizes(self.counts)):
+            inside[:-1, column] = torch.searchsorted(group, first_rows.int())
+        return inside + (sizes.cumsum(0) - sizes)
+
+    def _block(self, rows: slice, begin: list[int], end: list[int], starts: Tensor) -> Block:
+        runs = [(slice(a, b), element) for a, b, element in zip(begin, end, self.elements, strict=True) if b > a]
+        groups = [(self.inputs[run], self.outputs[run], element) for run, element in runs]
+        outputs = torch.cat([g[1] for g in groups] or [self.outputs[:0]])
+        own = starts[rows.start : rows.stop + 1]
+        order = torch.sort(outputs, stable=True)[1].int()
+        return Block(rows, groups, len(outputs), order, (own - own[0]).int())
 
 
 @dataclass
@@ -143,7 +179,7 @@ def _make_submanifold(sites: _Sites, voxels: Voxels, kernel: Kernel) -> Rulebook
     elements = (*half, *(kernel.volume - 1 - e for e in half))
     return Rulebook(
         torch.cat([neighbours, rows]), torch.cat([rows, neighbours]), elements, counts * 2, len(keys), len(keys),
-        True, kernel.volume,
+        kernel.volume, True,
     )  # fmt: skip
 
 
@@ -253,10 +289,8 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     rows = torch.arange(len(unique), dtype=torch.int32, device=key.device)
     outputs[order] = torch.repeat_interleave(rows, pairs, output_size=len(order))
     inputs = (flat % max(len(b), 1)).int()
-    book = Rulebook(
-        inputs, outputs, tuple(range(kernel.volume)), counts, len(b), len(unique), False, kernel.volume,
-        order.int(), row_starts(pairs).int(),
-    )  # fmt: skip
+    elements = tuple(range(kernel.volume))
+    book = Rulebook(inputs, outputs, elements, counts, len(b), len(unique), kernel.volume)
     return StridedRulebook(book, cell_index(unique, shape), shape)
 
 

@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from lidarfw.errors import LidarfwError
-from lidarfw.ops.rulebook import Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
+from lidarfw.ops.rulebook import Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
 from lidarfw.types import Grid, Voxels
 
 _local = threading.local()
@@ -44,31 +44,37 @@ def _scratch(name: str, rows: int, columns: int, like: Tensor) -> Tensor:
     return buffers[key][: rows * columns].view(rows, columns)
 
 
+def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
+    """(num_outputs, C_out): every pair's input row times the weight of its element, summed by output row.
+
+    Block by block: per element gather the rows, multiply; then sum the products, and add the product of
+    the centre, which is an identity and needs no gathering.
+    """
+    output = features.new_empty(book.num_outputs, weight.shape[2])
+    weights = weight.unbind()
+    for block in book.blocks():
+        products = _scratch("products", block.pairs, weight.shape[2], features)
+        at = 0
+        for inputs, _, element in block.groups:
+            rows = _gather(features, inputs, "rows")
+            torch.mm(rows, weights[element], out=products[at : at + len(inputs)])
+            at += len(inputs)
+        _sum_block(block, products, output)
+        if book.symmetric:
+            output[block.rows].addmm_(features[block.rows], weights[book.volume // 2])
+    return output
+
+
 def _gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
     return torch.index_select(features, 0, rows, out=_scratch(name, len(rows), features.shape[1], features))
 
 
-def _multiply_sum(gathered: Tensor, weights: list[Tensor], book: Rulebook) -> Tensor:
-    """Sum by output row (M, C_out) of gathered (P, C_in) times the weight of each pair's element."""
-    products = _scratch("products", len(book), weights[0].shape[1], gathered)
-    groups = zip(
-        gathered.split_with_sizes(book.counts), products.split_with_sizes(book.counts), book.elements, strict=True
-    )
-    for rows, product, element in groups:
-        if len(rows):
-            torch.mm(rows, weights[element], out=product)
-    order, starts = book.by_output()
-    return F.embedding_bag(order, products, starts, mode="sum", include_last_offset=True)
-
-
-def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
-    if len(book):
-        output = _multiply_sum(_gather(features, book.inputs, "rows"), list(weight.unbind()), book)
+def _sum_block(block: Block, products: Tensor, output: Tensor) -> None:
+    """Write the sums of the products (pairs, C) to the block's rows of the output."""
+    if block.pairs:
+        output[block.rows] = F.embedding_bag(block.order, products, block.starts, mode="sum", include_last_offset=True)
     else:
-        output = features.new_zeros(book.num_outputs, weight.shape[2])
-    if book.symmetric:
-        output.addmm_(features, weight[book.volume // 2])
-    return output
+        output[block.rows] = 0
 
 
 class _Convolution(torch.autograd.Function):
@@ -86,32 +92,39 @@ class _Convolution(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         features, weight = ctx.saved_tensors
         need_features, need_weight, _ = ctx.needs_input_grad
-        book, gradient = ctx.book.transposed(), gradient.contiguous()
         with torch.autocast(features.device.type, enabled=False):
-            rows = _gather(gradient, book.inputs, "rows")
-            d_weight = _weight_gradient(features, weight, gradient, rows, book) if need_weight else None
-            d_features = _feature_gradient(weight, gradient, rows, book) if need_features else None
+            d_features, d_weight = _gradients(
+                features, weight, gradient.contiguous(), ctx.book.transposed(), need_features, need_weight
+            )
         return d_features, d_weight, None
 
 
-def _weight_gradient(features: Tensor, weight: Tensor, gradient: Tensor, rows: Tensor, book: Rulebook) -> Tensor:
-    inputs = _gather(features, book.outputs, "products")
-    result = torch.zeros_like(weight)
-    groups = (inputs.split_with_sizes(book.counts), rows.split_with_sizes(book.counts), book.elements)
-    for left, right, element in zip(*groups, strict=True):
-        torch.mm(left.t(), right, out=result[element])
+def _gradients(
+    features: Tensor, weight: Tensor, gradient: Tensor, book: Rulebook, need_features: bool, need_weight: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """Gradients of features and weight, over the transposed rulebook, which leads from outputs to inputs."""
+    flipped = weight.transpose(1, 2).contiguous().unbind()
+    d_features = torch.empty_like(features) if need_features else None
+    d_weight = torch.zeros_like(weight) if need_weight else None
+    for block in book.blocks():
+        products = _scratch("products", block.pairs, weight.shape[1], gradient)
+        at = 0
+        for inputs, outputs, element in block.groups:
+            rows = _gather(gradient, inputs, "rows")
+            if d_weight is not None:
+                d_weight[element].addmm_(_gather(features, outputs, "features").t(), rows)
+            if need_features:
+                torch.mm(rows, flipped[element], out=products[at : at + len(inputs)])
+            at += len(inputs)
+        if d_features is not None:
+            _sum_block(block, products, d_features)
     if book.symmetric:
-        torch.mm(features.t(), gradient, out=result[book.volume // 2])
-    return result
-
-
-def _feature_gradient(weight: Tensor, gradient: Tensor, rows: Tensor, book: Rulebook) -> Tensor:
-    flipped = weight.transpose(1, 2).contiguous()
-    if len(book):
-        result = _multiply_sum(rows, list(flipped.unbind()), book)
-    else:
-        result = gradient.new_zeros(book.num_outputs, weight.shape[1])
-    return result.addmm_(gradient, flipped[book.volume // 2]) if book.symmetric else result
+        centre = book.volume // 2
+        if d_features is not None:
+            d_features.addmm_(gradient, flipped[centre])
+        if d_weight is not None:
+            torch.mm(features.t(), gradient, out=d_weight[centre])
+    return d_features, d_weight
 
 
 def _triple(value: int | tuple[int, int, int]) -> Triple:
@@ -297,8 +310,7 @@ class SparseAvgPool3d(_SparsePool3d):
     def forward(self, voxels: Voxels) -> Voxels:
         book = strided_rulebook(voxels, self.kernel).book
         summed = cast(Tensor, _PairSum.apply(voxels.features, book))  # type: ignore[no-untyped-call]
-        starts = book.by_output()[1]
-        return strided_voxels(voxels, self.kernel, summed / starts.diff()[:, None].to(summed.dtype))
+        return strided_voxels(voxels, self.kernel, summed / book.pairs_per_output()[:, None].to(summed.dtype))
 
 
 class _PairSum(torch.autograd.Function):
@@ -316,11 +328,11 @@ class _PairSum(torch.autograd.Function):
 
 
 def _pair_sum(features: Tensor, book: Rulebook) -> Tensor:
-    if not len(book):
-        return features.new_zeros(book.num_outputs, features.shape[1])
-    order, starts = book.by_output()
-    rows = book.inputs.index_select(0, order)
-    return F.embedding_bag(rows, features, starts, mode="sum", include_last_offset=True)
+    output = features.new_empty(book.num_outputs, features.shape[1])
+    for block in book.blocks():
+        inputs = torch.cat([inputs for inputs, _, _ in block.groups] or [book.inputs[:0]])
+        _sum_block(block, _gather(features, inputs, "products"), output)
+    return output
 
 
 class SparseSequential(nn.Sequential):
