@@ -140,6 +140,8 @@ def test_class_without_anchor_is_refused_with_a_fix() -> None:
     with pytest.raises(ConfigError, match=r"'Tram'[\s\S]*head\.anchor\.anchors=\{Tram: \{size"):
         head_of(("Car", "Tram"))
     tram = {"size": [16.0, 2.5, 3.5], "bottom": -1.8, "matched": 0.6, "unmatched": 0.4}
+    with pytest.raises(ConfigError, match="'Tram'"):
+        head_of(("Car", "Truck"), anchors={"Tram": tram})
     head = head_of(("Car", "Tram"), anchors={"Tram": tram})
     assert head.anchors.view(32, 32, 2, 2, 7)[0, 0, 1, 0, 3].item() == 16.0
     torch.testing.assert_close(head.thresholds, torch.tensor([[0.6, 0.45], [0.6, 0.4]]))
@@ -153,10 +155,13 @@ def test_class_without_anchor_is_refused_with_a_fix() -> None:
         {"size": [3.9, 1.6, 1.5], "bottom": -1.78, "matched": 0.4, "unmatched": 0.45},
         {"size": [3.9, 1.6, 1.5], "matched": 0.6, "unmatched": 0.45},
         {"size": [3.9, 1.6, 1.5], "bottom": -1.78, "matched": 0.6, "unmatched": 0.45, "botom": 1},
+        {"size": 3, "bottom": -1.78, "matched": 0.6, "unmatched": 0.45},
+        {"size": [3.9, 1.6, 1.5], "bottom": "low", "matched": 0.6, "unmatched": 0.45},
+        3,
     ],
 )
-def test_wrong_anchor_is_refused(anchor: dict[str, object]) -> None:
-    with pytest.raises(ConfigError, match=r"head\.anchor\.anchors\.Car"):
+def test_wrong_anchor_is_refused(anchor: object) -> None:
+    with pytest.raises(ConfigError, match=r"anchors\.Car needs size"):
         head_of(anchors={"Car": anchor})
 
 

@@ -20,7 +20,7 @@ class ScoreFilter(Filter):
 
     def __init__(self, boxes: Spec, *, score: dict[str, float] | None = None, default_score: float = 0.3) -> None:
         super().__init__()
-        values = per_class(boxes.classes, score, default_score, "filter.score.score")
+        values = per_class(boxes.classes, score, default_score, "score")
         self.register_buffer("score", torch.tensor(values), persistent=False)
         self.provides = boxes
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lidarfw.components.per_class import check_names
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Head
 from lidarfw.types import BEV, Boxes, DataSpec, Record, Spec
@@ -69,26 +70,36 @@ def turn(yaw: Tensor, direction: Tensor) -> Tensor:
     return (half + math.pi).remainder(2 * math.pi) - math.pi
 
 
-def _checked(name: str, anchor: dict[str, Any]) -> dict[str, Any]:
+def _makes_sense(anchor: Any) -> bool:
+    try:
+        size, bottom = [float(v) for v in anchor["size"]], float(anchor["bottom"])
+        in_order = 0 < float(anchor["unmatched"]) <= float(anchor["matched"]) <= 1
+    except (TypeError, KeyError, ValueError):
+        return False
+    return (
+        set(anchor) == set(KITTI_ANCHORS["Car"])
+        and len(size) == 3
+        and min(size) > 0
+        and in_order
+        and math.isfinite(bottom)
+    )
+
+
+def _checked(name: str, anchor: Any) -> dict[str, Any]:
     """The anchor of a class; ConfigError where a key is missing or a value makes no sense."""
-    example = f"{{{name}: {{size: [3.9, 1.6, 1.56], bottom: -1.78, matched: 0.6, unmatched: 0.45}}}}"
-    wrong = set(KITTI_ANCHORS["Car"]) ^ set(anchor)
-    if wrong:
+    if not _makes_sense(anchor):
         raise ConfigError(
-            f"head.anchor.anchors.{name}: needs size, bottom, matched and unmatched, each once; wrong: "
-            f"{', '.join(sorted(map(str, wrong)))}.\n  for example {example}"
+            f"anchors.{name} needs size (length, width, height > 0), bottom (all in metres), and IoUs "
+            f"0 < unmatched <= matched <= 1.\n  found: {anchor}\n"
+            f"  for example: 'head.anchor.anchors={{{name}: {{size: [3.9, 1.6, 1.56], bottom: -1.78, "
+            f"matched: 0.6, unmatched: 0.45}}}}'"
         )
-    size = list(anchor["size"])
-    if len(size) != 3 or min(size) <= 0 or not 0 < anchor["unmatched"] <= anchor["matched"] <= 1:
-        raise ConfigError(
-            f"head.anchor.anchors.{name}: size must be length, width, height in metres and "
-            f"0 < unmatched <= matched <= 1, found {dict(anchor)}.\n  for example {example}"
-        )
-    return anchor
+    return dict(anchor)
 
 
 def _of_classes(classes: tuple[str, ...], given: dict[str, Any] | None) -> list[dict[str, Any]]:
     """One anchor per class: the given ones before those of KITTI."""
+    check_names(classes, given or {}, "anchors")
     known = KITTI_ANCHORS | dict(given or {})
     missing = [name for name in classes if name not in known]
     if missing:
@@ -96,7 +107,7 @@ def _of_classes(classes: tuple[str, ...], given: dict[str, Any] | None) -> list[
             f"{n}: {{size: [4.0, 1.8, 1.6], bottom: -1.8, matched: 0.6, unmatched: 0.45}}" for n in missing
         )
         raise ConfigError(
-            f"head 'anchor' has no anchor for the class{'es' * (len(missing) > 1)} {', '.join(map(repr, missing))}.\n"
+            f"no anchor for the class{'es' * (len(missing) > 1)} {', '.join(map(repr, missing))}.\n"
             f"  anchors there: {', '.join(known)}\n"
             f"  fix, with your sizes (l, w, h) and bottom height in metres: 'head.anchor.anchors={{{entries}}}'\n"
             f"  or take a head without anchors: head=center"
@@ -112,7 +123,7 @@ class AnchorHead(Head):
     Car, Pedestrian and Cyclist. `decode` takes the `max_objects` best anchors of each sample with a score of at least
     `score_threshold`.
 
-    Raises ConfigError for a class without an anchor.
+    Raises ConfigError for a class without an anchor, and for an anchor of a class that the data does not have.
     """
 
     defaults = {"loss": ["anchor"], "postprocessor": ["nms"], "metric": ["box_ap"]}

@@ -79,7 +79,7 @@ def _group_numbers(classes: tuple[str, ...], groups: list[list[str]] | None) -> 
     named = sorted(name for names in groups for name in names)
     if named != sorted(classes):
         raise ConfigError(
-            f"head.center.groups must hold every class exactly once.\n  classes of the data: {', '.join(classes)}\n"
+            f"groups must hold every class exactly once.\n  classes of the data: {', '.join(classes)}\n"
             f"  groups: {[list(names) for names in groups]}\n"
             f"  fix, one group per class: 'head.center.groups=[{','.join(f'[{name}]' for name in classes)}]'"
         )

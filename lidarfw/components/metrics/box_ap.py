@@ -67,7 +67,7 @@ class BoxAP(Metric):
         super().__init__()
         usual = {name: value for name, value in USUAL_IOU.items() if name in boxes.classes}
         self.classes = boxes.classes
-        self.iou = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "metric.box_ap.iou")
+        self.iou = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "iou")
         self.add_state("detections", default=[], dist_reduce_fx="cat")
         self.add_state("objects", default=torch.zeros(len(boxes.classes), dtype=torch.long), dist_reduce_fx="sum")
         self._start()

@@ -81,7 +81,7 @@ class CircleNMS(PostProcessor):
         super().__init__()
         self.score_threshold = score_threshold
         self.max_candidates, self.max_per_frame = max_candidates, max_per_frame
-        values = per_class(boxes.classes, radius, default_radius, "postprocessor.circle_nms.radius")
+        values = per_class(boxes.classes, radius, default_radius, "radius")
         self.register_buffer("radius", torch.tensor(values), persistent=False)
         self.provides = boxes
 

@@ -24,7 +24,7 @@ class ExactRetriever(Retriever):
     def __init__(self, *, chunk: int = 8192) -> None:
         super().__init__()
         if chunk < 1:
-            raise ConfigError(f"retriever.exact.chunk must be at least 1, found {chunk}")
+            raise ConfigError(f"chunk must be at least 1, found {chunk}")
         self.chunk = chunk
 
     def build(self, descriptors: Descriptors, poses: Poses) -> Index:

@@ -51,7 +51,7 @@ class GreedyTracker(Tracker):
         frame_time: float = 0.1,
     ) -> None:
         super().__init__()
-        values = per_class(boxes.classes, max_distance, default_distance, "tracker.greedy.max_distance")
+        values = per_class(boxes.classes, max_distance, default_distance, "max_distance")
         self.register_buffer("max_distance", torch.tensor(values), persistent=False)
         self.max_age, self.frame_time = max_age, frame_time
         self.provides = Spec(Tracks, classes=boxes.classes)
