@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+collect_ignore = ["fixtures"]  # other people's projects: their tests run where they are installed
 ROOT = Path(__file__).resolve().parents[1]
 UNPACK = ROOT.parent / "shared" / "data" / "unpack.py"
 VARIABLE = "LIDARFW_REAL_DATA"

@@ -48,13 +48,17 @@ class Names:
         return "losses" if self.slot == "loss" else f"{self.slot}s"
 
     @property
+    def stem(self) -> str:
+        return "".join(part.capitalize() for part in self.component.split("_"))
+
+    @property
     def cls(self) -> str:
-        return "".join(part.capitalize() for part in self.component.split("_")) + SLOTS[self.slot]
+        return self.stem + SLOTS[self.slot]
 
     @property
     def entry_points(self) -> str:
         """The tables of pyproject.toml; a head brings its loss."""
-        values = {self.slot: self.cls} | ({"loss": f"{self.cls}Loss"} if self.slot == "head" else {})
+        values = {self.slot: self.cls} | ({"loss": f"{self.stem}Loss"} if self.slot == "head" else {})
         return "\n".join(
             f'[project.entry-points."lidarfw.{slot}"]\n{self.component} = "{self.package}.{self.module}:{cls}"\n'
             for slot, cls in values.items()
@@ -124,7 +128,7 @@ def _values(names: Names) -> dict[str, str]:
     major, minor = lidarfw.__version__.split(".")[:2]
     commands = [f"lidarfw {command} experiment={names.experiment}\n" for command in ("show", "train")]
     row = f"| `{names.package}/conf/experiment/{names.experiment}.yaml` | an experiment: what it is combined with |\n"
-    fields = ("distribution", "slot", "component", "package", "module", "cls", "entry_points", "selection")
+    fields = ("distribution", "slot", "component", "package", "module", "stem", "cls", "entry_points", "selection")
     return {name: getattr(names, name) for name in fields} | {
         "version": f"{major}.{minor}",
         "next_version": f"{major}.{int(minor) + 1}",

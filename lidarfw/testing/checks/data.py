@@ -166,6 +166,9 @@ def points_stay_in_their_boxes(subject: Subject) -> None:
         require(len(points) == len(labels), f"{len(points)} points have {len(labels)} labels")
         inside = points_in_boxes(points.xyz, _grown(boxes).tensor)
         own = labels.label >= 0
+        filled = torch.isin(torch.arange(len(boxes)), inside[own])
+        text = f"seed {seed}: only {int(filled.sum())} of {len(boxes)} boxes still hold points of their object"
+        require(2 * int(filled.sum()) >= len(boxes), text)
         strays = own & (inside < 0) & _of_kept(labels, inside)
         require(
             int(strays.sum()) == 0, f"seed {seed}: {int(strays.sum())} of {int(own.sum())} object points left their box"
