@@ -394,7 +394,7 @@ def curves(metrics: dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
 
 
 def _groups(names: list[str]) -> dict[str, list[str]]:
-    rates = [name for name in names if name.startswith("lr")]
+    rates = [name for name in names if name.startswith(("lr", "learning_rate"))]
     losses = [name for name in names if "loss" in name.split("/")[0] or "/loss" in name]
     figures = [name for name in names if name not in losses and name.split("/")[0] in ("val", "test")]
     totals = [name for name in losses if name.endswith("total")]
@@ -423,7 +423,7 @@ def _curve_panel(
         axes.set_ylim(-0.03, 1.03)
     elif title.startswith(("Loss", "Terms")) and values.min() > 0 and values.max() > 20 * np.median(values):
         axes.set_yscale("log")
-    if len(curves) > 1:
+    if len(curves) > 1 or title != "Loss":
         axes.legend(fontsize=7, frameon=False, loc="best", ncols=1 if len(curves) <= 6 else 2)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import platform
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -35,7 +36,10 @@ p.sub { color: #59636e; margin-top: .2em; } img { max-width: 100%; display: bloc
 table { border-collapse: collapse; font-size: .92em; } td, th { padding: .25em .9em .25em 0; text-align: left;
   border-bottom: 1px solid #eee; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
 pre { background: #f6f8fa; padding: .8em; overflow-x: auto; font-size: 12px; border-radius: 6px; }
-figure { margin: 1em 0; } figcaption { color: #59636e; font-size: .9em; }
+figure { margin: 1em 0; } figure img { cursor: zoom-in; }
+input:checked + img { position: fixed; inset: 0; margin: auto; max-width: 98vw; max-height: 98vh; cursor: zoom-out;
+  box-shadow: 0 0 0 100vmax #000b; }
+summary { cursor: pointer; } figcaption { color: #59636e; font-size: .9em; }
 .frames { display: grid; grid-template-columns: repeat(auto-fit, minmax(440px, 1fr)); gap: 1em; }
 """
 
@@ -76,7 +80,7 @@ def write_report(
         _section("Wiring", _wiring(model)),
         _section("Time", _table(["stage", "seconds"], [(k, f"{v:.1f}") for k, v in (seconds or {}).items()])),
         _section("Environment", _table(["", ""], _environment(model))),
-        _section("Config", f"<pre>{html.escape(yaml.safe_dump(model.plan.config, sort_keys=False))}</pre>"),
+        _section("Config", _config(model)),
     ]
     text = f"<!doctype html><html lang=en><meta charset=utf-8><title>{_name(folder)}</title><style>{_STYLE}</style>"
     write_text(folder / "report.html", text + "\n".join(parts) + "</html>\n")
@@ -114,13 +118,15 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _cell(text: str) -> str:
-    return f"<td{' class=n' if text.replace('.', '').isdigit() else ''}>{html.escape(text)}</td>"
+    number = re.fullmatch(r"-?\d+\.\d+", text)
+    return f"<td{' class=n' if number else ''}>{html.escape(text)}</td>"
 
 
 def _image(picture: draw.Picture, caption: str) -> str:
     data = base64.b64encode(draw.png_bytes(picture)).decode()
     text = html.escape(caption)
-    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
+    picture_tag = f'<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f"<figure><label><input type=checkbox hidden>{picture_tag}</label><figcaption>{text}</figcaption></figure>"
 
 
 def _header(folder: Path, checkpoint: Path, model: PerceptionModel) -> str:
@@ -175,6 +181,12 @@ def _wiring(model: PerceptionModel) -> str:
     from lidarfw.commands.show import table
 
     return f"<pre>{html.escape(table(model.plan, model))}</pre>"
+
+
+def _config(model: PerceptionModel) -> str:
+    text = yaml.safe_dump(model.plan.config, sort_keys=False, default_flow_style=None, width=120)
+    lines = text.count("\n")
+    return f"<details><summary>the whole config ({lines} lines)</summary><pre>{html.escape(text)}</pre></details>"
 
 
 def _environment(model: PerceptionModel) -> list[tuple[str, str]]:
