@@ -7,10 +7,11 @@ from typing import Any
 
 import torch
 
-from lidarfw.testing.checks.compare import copied, difference, finite, floats, sample
+from lidarfw.testing.checks.compare import boxes_difference, copied, difference, finite, floats, sample
 from lidarfw.testing.checks.shape import mismatch
 from lidarfw.testing.checks.subject import Built, Subject, accepted_variations, build, check, require
 from lidarfw.testing.examples import empty, street, thinned
+from lidarfw.types import Boxes
 
 MODULES = ("backbone", "neck", "head", "postprocessor")
 TOLERANCE = 1e-4  # convolutions of other batch sizes add up in another order
@@ -65,7 +66,9 @@ def batch_mates_do_not_matter(subject: Subject) -> None:
     first, second, third = street()[:3]
     alone = sample(built.result([first]), 0)
     for frames, number in (([first, second], 0), ([third, first], 1), ([empty(second), first], 1)):
-        text = difference(alone, sample(built.result(frames), number), TOLERANCE)
+        beside = sample(built.result(frames), number)
+        compare = boxes_difference if isinstance(alone, Boxes) else difference
+        text = compare(alone, beside, TOLERANCE)
         require(not text, f"frame {number} of a batch of {len(frames)} differs from the same frame alone: {text}")
 
 
