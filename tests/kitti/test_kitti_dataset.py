@@ -14,6 +14,7 @@ from lidarfw import kitti
 from lidarfw.components.datasets.kitti import KittiDataset
 from lidarfw.errors import DataError
 from lidarfw.ops import points_in_boxes_mask
+from lidarfw.testing.checks import run_checks
 from lidarfw.types import Boxes, Camera, DataSpec, Points, Spec, collate
 
 CAR, PEDESTRIAN, CYCLIST = 0, 1, 2
@@ -105,6 +106,16 @@ def test_spec_needs_no_files_and_frames_fit_it(kitti_root):
     batch = collate([KittiDataset(root=str(kitti_root), split=s, image=True)[0] for s in ("train", "val", "train")])
     assert batch.inputs["points"].features.shape[1] == 1
     assert batch.targets.ignored.batch.tolist() == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+
+
+@pytest.mark.parametrize("image", [False, True])
+def test_keeps_the_rules_of_a_dataset(kitti_root, image, monkeypatch):
+    """All checks of the conformance kit that need the files."""
+    monkeypatch.setattr(KittiDataset, "example", {"root": str(kitti_root), "split": "all", "image": image}, False)
+    results = run_checks(KittiDataset)
+    assert [r for r in results if r.status == "failed"] == []
+    passed = {r.check for r in results if r.status == "passed"}
+    assert {"frames_match_the_spec", "frames_can_be_read_anywhere", "sequences_hold_every_frame_once"} <= passed
 
 
 def test_import_and_spec_do_not_import_torch():
