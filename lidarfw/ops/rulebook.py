@@ -9,7 +9,6 @@ never wraps to another line; the order of the keys is the canonical order.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -19,13 +18,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lidarfw.ops.cells import cell_index, cell_key, key_type, row_starts
+from lidarfw.ops.scratch import scratch, zeroed
 from lidarfw.types import Voxels
 
 Triple = tuple[int, int, int]
 
-_TABLE_CELLS = 2**24  # a dense lookup table of up to so many cells (64 MB) is faster than searching
-_BLOCK_PAIRS = 2**16
-_local = threading.local()
+_TABLE = 2**22  # chunks of the key space that the first lookup table counts: 16 MB
+_BLOCK_PAIRS = 2**16  # pairs computed at a time: their products, 16 MB at 64 channels, stay in the cache
 
 
 @dataclass(frozen=True)
@@ -188,49 +187,44 @@ def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tens
     if not len(keys) or not shifts:
         none = torch.zeros(0, dtype=torch.int32, device=keys.device)
         return none, none, (0,) * len(shifts)
-    table_fits = cells <= _TABLE_CELLS
-    neighbour = _find_in_table(keys, shifts, cells) if table_fits else _find_by_search(keys, shifts)
-    hit = (neighbour >= 0).view(len(shifts), -1)
-    flat = hit.view(-1).nonzero().squeeze(1)
-    counts = tuple(hit.sum(1).tolist())
-    rows = (flat % len(keys)).int()
-    return rows, neighbour.view(-1).index_select(0, flat), counts
+    wanted = (keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]).view(-1)
+    neighbour = _look_up(keys, wanted, cells)
+    hit = neighbour >= 0
+    counts = tuple(hit.view(len(shifts), -1).sum(1).tolist())
+    found = hit.nonzero().squeeze(1)
+    neighbour = neighbour.index_select(0, found)
+    for number, group in enumerate(found.split_with_sizes(counts)):
+        group -= number * len(keys)
+    return found.int(), neighbour, counts
 
 
-def _find_in_table(keys: Tensor, shifts: Sequence[int], cells: int) -> Tensor:
-    """Row of keys + shift or -1, (shifts, N) int32, by a dense table that is cleaned after use."""
-    table, places = _table(cells, keys.device), keys.long()
-    table.index_copy_(0, places, torch.arange(len(keys), dtype=torch.int32, device=keys.device))
-    wanted = keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]
-    found = table.index_select(0, wanted.view(-1))
-    table.index_fill_(0, places, -1)
-    return found.view(len(shifts), -1)
+def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
+    """Row (K,) int32 of `keys` (N,), which ascend, that equals each of `wanted` (K,), or -1.
 
-
-def _table(cells: int, device: torch.device) -> Tensor:
-    """This thread's table of at least so many -1."""
-    tables: dict[torch.device, Tensor] = _local.__dict__.setdefault("tables", {})
-    if device not in tables or len(tables[device]) < cells:
-        tables[device] = torch.full((cells,), -1, dtype=torch.int32, device=device)
-    return tables[device]
-
-
-def _find_by_search(keys: Tensor, shifts: Sequence[int]) -> Tensor:
-    """Row of keys + shift or -1, (shifts, N) int32: one binary search per run of consecutive shifts.
-
-    The next shift of a run lies at the same place of the sorted keys or, after a hit, at the next.
+    Two tables: the first numbers those of at most `_TABLE` equal chunks of the key space that hold a key, the
+    second holds the rows, cell by cell, of the numbered chunks. Both fit a processor's cache where one table
+    over all cells would not, and the first is swept of what was written instead of being made anew.
     """
-    padded = F.pad(keys, (0, len(shifts) + 1), value=torch.iinfo(keys.dtype).max)
-    found = torch.empty(len(shifts), len(keys), dtype=torch.int32, device=keys.device)
-    place = wanted = keys
-    for number, shift in enumerate(shifts):
-        wanted = keys + shift
-        if number == 0 or shift != shifts[number - 1] + 1:
-            place = torch.searchsorted(keys, wanted, out_int32=True)
-        hit = padded.index_select(0, place) == wanted
-        found[number] = torch.where(hit, place, -1)
-        place = place + hit
+    bits = ((cells - 1) // _TABLE).bit_length()
+    chunk, rows = keys >> bits, torch.arange(len(keys), dtype=torch.int32, device=keys.device)
+    number = F.pad((chunk[1:] != chunk[:-1]).cumsum(0, dtype=torch.int32), (1, 0)) + 1
+    if len(keys) << bits > _TABLE * 64 and (int(number[-1]) + 1) << bits > _TABLE * 64:
+        return _search(keys, wanted)
+    written = chunk.long()
+    numbers = zeroed("chunks", (cells >> bits) + 1, rows).index_copy_(0, written, number)
+    cell = scratch("cells", (int(number[-1]) + 1) << bits, 1, rows).view(-1).fill_(-1)
+    inside = (1 << bits) - 1
+    cell.index_copy_(0, (number.long() << bits) + (keys & inside), rows)
+    place = numbers.index_select(0, wanted >> bits).bitwise_left_shift_(bits)
+    found = cell.index_select(0, place.add_(wanted & inside))
+    numbers.index_fill_(0, written, 0)
     return found
+
+
+def _search(keys: Tensor, wanted: Tensor) -> Tensor:
+    """`_look_up` by binary search, for few keys in a huge space."""
+    place = torch.searchsorted(keys, wanted, out_int32=True).clamp_(max=len(keys) - 1)
+    return torch.where(keys[place] == wanted, place, -1)
 
 
 @dataclass
@@ -287,7 +281,7 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     unique, pairs = torch.unique_consecutive(key, return_counts=True)
     outputs = torch.empty(len(order), dtype=torch.int32, device=key.device)
     rows = torch.arange(len(unique), dtype=torch.int32, device=key.device)
-    outputs[order] = torch.repeat_interleave(rows, pairs, output_size=len(order))
+    outputs.index_copy_(0, order, torch.repeat_interleave(rows, pairs, output_size=len(order)))
     inputs = (flat % max(len(b), 1)).int()
     elements = tuple(range(kernel.volume))
     book = Rulebook(inputs, outputs, elements, counts, len(b), len(unique), kernel.volume)

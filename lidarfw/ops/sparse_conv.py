@@ -13,7 +13,6 @@ Weights are (kernel volume, C_in, C_out), elements in z, y, x order: the dense `
 from __future__ import annotations
 
 import math
-import threading
 from typing import Any, cast
 
 import torch
@@ -23,25 +22,8 @@ from torch.nn import functional as F
 
 from lidarfw.errors import LidarfwError
 from lidarfw.ops.rulebook import Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
+from lidarfw.ops.scratch import scratch
 from lidarfw.types import Grid, Voxels
-
-_local = threading.local()
-
-
-def _scratch(name: str, rows: int, columns: int, like: Tensor) -> Tensor:
-    """An uninitialised (rows, columns) matrix that lives until the next call of the same name.
-
-    On the CPU a fresh large tensor costs more in page faults than the work on it, so one buffer per
-    thread grows to the largest request. CUDA's allocator keeps blocks itself, and per stream.
-    """
-    if like.device.type != "cpu":
-        return like.new_empty(rows, columns)
-    buffers: dict[tuple[str, torch.dtype], Tensor] = _local.__dict__.setdefault("buffers", {})
-    key = (name, like.dtype)
-    if key not in buffers or buffers[key].numel() < rows * columns:
-        buffers.pop(key, None)
-        buffers[key] = torch.empty(rows * columns, dtype=like.dtype)
-    return buffers[key][: rows * columns].view(rows, columns)
 
 
 def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
@@ -53,7 +35,7 @@ def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
     output = features.new_empty(book.num_outputs, weight.shape[2])
     weights = weight.unbind()
     for block in book.blocks():
-        products = _scratch("products", block.pairs, weight.shape[2], features)
+        products = scratch("products", block.pairs, weight.shape[2], features)
         at = 0
         for inputs, _, element in block.groups:
             rows = _gather(features, inputs, "rows")
@@ -66,7 +48,7 @@ def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
 
 
 def _gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
-    return torch.index_select(features, 0, rows, out=_scratch(name, len(rows), features.shape[1], features))
+    return torch.index_select(features, 0, rows, out=scratch(name, len(rows), features.shape[1], features))
 
 
 def _sum_block(block: Block, products: Tensor, output: Tensor) -> None:
@@ -107,7 +89,7 @@ def _gradients(
     d_features = torch.empty_like(features) if need_features else None
     d_weight = torch.zeros_like(weight) if need_weight else None
     for block in book.blocks():
-        products = _scratch("products", block.pairs, weight.shape[1], gradient)
+        products = scratch("products", block.pairs, weight.shape[1], gradient)
         at = 0
         for inputs, outputs, element in block.groups:
             rows = _gather(gradient, inputs, "rows")

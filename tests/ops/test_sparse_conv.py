@@ -67,10 +67,10 @@ def assert_same_gradients(ours: Tensor, expected: Tensor, inputs: list[Tensor]) 
 
 
 @pytest.mark.parametrize(("size", "dilation"), SUBMANIFOLD)
-@pytest.mark.parametrize("search", [True, False])
-def test_submanifold_equals_dense_convolution(size, dilation, search: bool, monkeypatch) -> None:
-    if search:
-        monkeypatch.setattr(rulebook, "_TABLE_CELLS", 0)
+@pytest.mark.parametrize("limits", [{}, {"_TABLE": 2**6}, {"_TABLE": 2}, {"_BLOCK_PAIRS": 32}], ids=str)
+def test_submanifold_equals_dense_convolution(size, dilation, limits: dict[str, int], monkeypatch) -> None:
+    for name, value in limits.items():  # several chunks, binary search, several blocks
+        monkeypatch.setattr(rulebook, name, value)
     voxels = make_voxels(150, 5, 2)
     conv = SubmanifoldConv3d(5, 4, size, dilation, bias=True).double()
     ours, expected = conv(voxels), at_cells(dense_conv(voxels, conv), voxels)
@@ -79,8 +79,10 @@ def test_submanifold_equals_dense_convolution(size, dilation, search: bool, monk
     assert_same_gradients(ours.features, expected, [voxels.features, conv.weight, conv.bias])
 
 
+@pytest.mark.parametrize("pairs", [2**16, 16])
 @pytest.mark.parametrize(("size", "stride", "padding", "dilation"), STRIDED)
-def test_strided_equals_dense_convolution(size, stride, padding, dilation) -> None:
+def test_strided_equals_dense_convolution(size, stride, padding, dilation, pairs: int, monkeypatch) -> None:
+    monkeypatch.setattr(rulebook, "_BLOCK_PAIRS", pairs)
     voxels = make_voxels(60, 5, 2)
     conv = SparseConv3d(5, 4, size, stride, padding, dilation, bias=True).double()
     ours, dense = conv(voxels), dense_conv(voxels, conv)
@@ -293,3 +295,19 @@ def test_export_says_what_to_do() -> None:
     voxels = make_voxels(20, 3)
     with pytest.raises(LidarfwError, match="Export the dense part"):
         torch.export.export(Wrapper(), (voxels.features.detach().float(), voxels.index), strict=False)
+
+
+def test_more_cells_than_an_int32_counts() -> None:
+    """Two clusters at the far ends of a grid of 2^33 cells give what they give in a small one."""
+    voxels, conv = make_voxels(60, 3, shape=(8, 10, 8)), SubmanifoldConv3d(3, 4).double()
+    near = voxels.index.repeat(2, 1)
+    near[len(voxels) :, 0] = 1
+    far, move = near.clone(), torch.tensor([0, 2000, 2000, 2000])
+    far[len(voxels) :] += move - torch.tensor([1, 0, 0, 0])
+    features, grid = voxels.features.repeat(2, 1), Grid((0, 0, 0), (2048, 2048, 2048), (1, 1, 1))
+    ours = conv(Voxels(features, far, grid, (2048, 2048, 2048)))
+    expected = conv(Voxels(features, near, voxels.grid, voxels.shape, batch_size=2))
+    torch.testing.assert_close(ours.features, expected.features)
+    down = SparseConv3d(3, 4, 2, 2).double()(Voxels(features, far, grid, (2048, 2048, 2048)))
+    assert down.index.max() >= 1000
+    assert len(down) == 2 * len(SparseConv3d(3, 4, 2, 2).double()(voxels))
