@@ -17,8 +17,8 @@ from lidarfw.types import BEV, Boxes, DataSpec, Record, Spec
 # sizes l, w, h and height of the bottom over the sensor (m); IoU from which an anchor is positive, below which negative
 KITTI_ANCHORS: dict[str, dict[str, Any]] = {
     "Car": {"size": [3.9, 1.6, 1.56], "bottom": -1.78, "matched": 0.6, "unmatched": 0.45},
-    "Pedestrian": {"size": [0.8, 0.6, 1.73], "bottom": -0.6, "matched": 0.5, "unmatched": 0.35},
-    "Cyclist": {"size": [1.76, 0.6, 1.73], "bottom": -0.6, "matched": 0.5, "unmatched": 0.35},
+    "Pedestrian": {"size": [0.8, 0.6, 1.73], "bottom": -1.465, "matched": 0.5, "unmatched": 0.35},
+    "Cyclist": {"size": [1.76, 0.6, 1.73], "bottom": -1.465, "matched": 0.5, "unmatched": 0.35},
 }
 YAWS = (0.0, math.pi / 2)  # of the anchors of every class and cell
 DIRECTION_OFFSET = math.pi / 4  # bin 0 holds yaws from pi/4 to 5 pi/4, so no anchor yaw lies on an edge of the bins
