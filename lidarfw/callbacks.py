@@ -79,10 +79,8 @@ class Checkpoints(Checkpoint):
             self.save_last(trainer)
 
     def save_last(self, trainer: pl.Trainer) -> None:
-        """Write last.ckpt now, and what was logged so far."""
+        """Write last.ckpt now."""
         self.saved_at = trainer.global_step
-        for logger in trainer.loggers:
-            logger.save()
         if not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self.folder / "last.ckpt", weights_only=False)
 
@@ -194,14 +192,15 @@ def _ends(trainer: pl.Trainer) -> bool:
 
 
 class MetricsFile(Logger):
-    """`metrics.csv`: one row per step. A resumed run goes on in the same file, from the step it resumed at."""
+    """`metrics.csv`: a row for every time that something is logged, written at once.
 
-    def __init__(self, save_dir: str, flush_every: int = 50) -> None:
+    A resumed run goes on in the same file, from the step it resumed at.
+    """
+
+    def __init__(self, save_dir: str) -> None:
         super().__init__()
         self.path = Path(save_dir) / "metrics.csv"
-        self.flush_every = flush_every
-        self._rows: dict[int, dict[str, Any]] | None = None
-        self._unsaved = 0
+        self._columns: list[str] = []
 
     @property
     def name(self) -> str:
@@ -219,36 +218,24 @@ class MetricsFile(Logger):
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Add figures to the row of a step."""
-        at = step or 0
-        if self._rows is None:
-            self._rows = {number: row for number, row in self._read().items() if number < at}
-        row = self._rows.setdefault(at, {})
-        row |= {key: float(value) for key, value in metrics.items()}
-        self._unsaved += 1
-        if self._unsaved >= self.flush_every:
-            self.save()
+        """Add a row."""
+        row = {"step": step or 0, **{name: float(value) for name, value in metrics.items()}}
+        if not set(row) <= set(self._columns):
+            rows = self._read() if self._columns else [old for old in self._read() if int(old["step"]) < row["step"]]
+            names = {name: None for old in (*rows, row) for name in old}
+            self._columns = list(dict.fromkeys([*self._columns, *names]))
+            self._write(rows)
+        with self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, self._columns).writerow(row)
 
-    @rank_zero_only
-    def save(self) -> None:
-        """Write the file."""
-        if not self._unsaved or self._rows is None:
-            return
-        columns = ["step", *sorted({key for row in self._rows.values() for key in row})]
-        with atomic_path(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns)
-            writer.writeheader()
-            writer.writerows({"step": step, **row} for step, row in sorted(self._rows.items()))
-        self._unsaved = 0
-
-    @rank_zero_only
-    def finalize(self, status: str) -> None:
-        """Write what is left."""
-        self.save()
-
-    def _read(self) -> dict[int, dict[str, Any]]:
+    def _read(self) -> list[dict[str, Any]]:
         if not self.path.exists():
-            return {}
+            return []
         with self.path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        return {int(row.pop("step")): {key: value for key, value in row.items() if value} for row in rows}
+            return list(csv.DictReader(file))
+
+    def _write(self, rows: list[dict[str, Any]]) -> None:
+        with atomic_path(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, self._columns)
+            writer.writeheader()
+            writer.writerows(rows)

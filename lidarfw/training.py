@@ -113,9 +113,9 @@ class PerceptionModule(pl.LightningModule):
 
     @property
     def progress(self) -> float:
-        """Share of the training that is done, 0..1; 1 where its length is not known."""
+        """Share of the training that is done after this step, up to 1; 1 where its length is not known."""
         total = self.trainer.estimated_stepping_batches
-        return min(1.0, self.global_step / total) if math.isfinite(total) and total else 1.0
+        return min(1.0, (self.global_step + 1) / total) if math.isfinite(total) and total else 1.0
 
     def _seed(self, *numbers: int) -> None:
         state = np.random.SeedSequence((self.seed, *numbers, self.global_rank)).generate_state(1, np.uint64)
@@ -128,7 +128,7 @@ class PerceptionModule(pl.LightningModule):
         finite = torch.isfinite(torch.stack([value.detach().float() for value in terms.values()]))
         if not bool(finite.all()):
             bad = [name for name, ok in zip(terms, finite.tolist(), strict=True) if not ok]
-            raise self._not_finite("loss " + ", ".join(f"{name} is {float(terms[name]):g}" for name in bad))
+            raise self._not_finite("loss " + ", ".join(f"{name} is {float(terms[name].detach()):g}" for name in bad))
 
     def _not_finite(self, what: str) -> TrainingError:
         return TrainingError(
