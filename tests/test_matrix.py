@@ -1,0 +1,103 @@
+"""Every combination of backbone, necks and head that is said to fit is built, trained for a step and decoded."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from lidarfw import assembly, declaration, registry
+from lidarfw.config import compose, to_plain
+from lidarfw.testing.synthetic import SyntheticDataset
+from lidarfw.types import Batch, Boxes, Frame, collate
+
+TOOL = Path(__file__).resolve().parents[1] / "tools" / "compat_table.py"
+_spec = importlib.util.spec_from_file_location("compat_table", TOOL)
+table = sys.modules["compat_table"] = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(table)
+
+AT_MOST = 40  # combinations that are built; with more, an even choice of them
+SECONDS = 3.0  # for one of them, on two cores
+POINTS = 500
+VALID = table.valid_combinations()
+BUILT = VALID[:: -(-len(VALID) // AT_MOST)]
+RANGE = {"lower": (0.0, -16.0, -3.0), "upper": (32.0, 16.0, 1.0)}  # metres
+
+
+@pytest.fixture(scope="module")
+def sizes() -> dict[str, dict[str, Any]]:
+    """Options that make each component small: those of its preset NAME_small, and a short range."""
+    found = {}
+    for slot in ("backbone", "neck", "head"):
+        for name in table.repository_names(slot):
+            small = Path(TOOL.parents[1] / "conf" / slot / f"{name}_small.yaml").exists()
+            node = to_plain(compose([f"{slot}={name}{'_small' * small}", *(["neck=[]"] if slot != "neck" else [])]))
+            options = {k: v for k, v in node[slot][name].items() if k not in ("type", "inputs")}
+            known = declaration.read(slot, name).options
+            found[f"{slot}.{name}"] = options | {k: v for k, v in RANGE.items() if k in known}
+    return found
+
+
+@pytest.fixture(scope="module")
+def batch() -> Batch:
+    dataset = SyntheticDataset(frames=2, points=2048, **table.INPUTS)
+    return collate([thin(dataset[index]) for index in range(2)])
+
+
+def thin(frame: Frame) -> Frame:
+    points = frame.inputs["points"]
+    chosen = torch.linspace(0, len(points) - 1, POINTS).long()
+    inputs = {**frame.inputs, "points": points[chosen]}
+    return frame.replace(inputs=inputs, targets=frame.targets.replace(points=frame.targets.points[chosen]))
+
+
+def test_the_page_is_what_the_rules_say() -> None:
+    assert table.PAGE.read_text(encoding="utf-8") == table.page(), "run: python tools/compat_table.py"
+
+
+def test_the_table_covers_what_is_installed() -> None:
+    assert len(VALID) >= 14
+    for slot, part in (("backbone", 0), ("head", 2)):
+        used = {(c.backbone, c.necks, c.head)[part] for c in VALID}
+        assert used == set(table.repository_names(slot)), f"a {slot} fits nowhere"
+    if len(BUILT) < len(VALID):
+        print(f"building {len(BUILT)} of {len(VALID)} combinations, evenly chosen")
+
+
+@pytest.mark.parametrize("combination", BUILT, ids=lambda c: c.id)
+def test_a_valid_combination_trains_and_decodes(
+    combination: Any, sizes: dict[str, dict[str, Any]], batch: Batch
+) -> None:
+    planned = assembly.plan(combination.config(sizes), table.data_spec())
+    for step in planned.steps:
+        registry.load(step.slot, step.declared.entry.name)  # importing is not what is timed
+    started = time.process_time()
+    torch.manual_seed(0)
+    model = assembly.build(planned).train()
+    optimizer = torch.optim.SGD(model.parameters(), lr=1e-3)
+    terms = model.losses(model(batch), batch)
+    total = torch.stack([term for named in terms.values() for term in named.values()]).sum()
+    total.backward()
+    assert total.isfinite()
+    assert [name for name, p in model.named_parameters() if p.grad is None or not p.grad.isfinite().all()] == []
+    optimizer.step()
+    with torch.no_grad():
+        results = model.eval().predict(batch)
+    assert [r.meta.id for r in results] == [m.id for m in batch.meta]
+    for result in results:
+        boxes = result.of(Boxes)
+        assert boxes.tensor.isfinite().all()
+        assert (boxes.label < 3).all()
+    assert time.process_time() - started < 2 * SECONDS
+
+
+def test_a_combination_that_does_not_fit_is_refused() -> None:
+    broken = table.Combination("second", (), "center")
+    assert not table.fits(broken, table.data_spec())
+    with pytest.raises(assembly.AssemblyError, match="height_compression"):
+        assembly.plan(broken.config(), table.data_spec())
