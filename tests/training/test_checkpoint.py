@@ -103,7 +103,7 @@ def test_a_cut_safetensors_file(trained, tmp_path):
     path = tmp_path / "model.safetensors"
     checkpoint.export(trained, path)
     path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(CheckpointError, match="model.safetensors cannot be read"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors cannot be read"):
         lidarfw.load(path)
 
 
@@ -114,7 +114,7 @@ def test_a_cut_safetensors_file(trained, tmp_path):
 def test_cut_off(share, file):
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(CheckpointError, match="model.ckpt cannot be read: it is (empty|cut off)") as error:
+    with pytest.raises(CheckpointError, match=r"model\.ckpt cannot be read: it is (empty|cut off)") as error:
         lidarfw.load(file)
     assert len(str(error.value).splitlines()) <= 10
 
@@ -139,7 +139,7 @@ def test_a_flipped_bit_is_noticed(seed, file):
     place = raw.index(data[:64]) + rng.randrange(len(data))
     raw[place] ^= 1 << rng.randrange(8)
     file.write_bytes(raw)
-    with pytest.raises(CheckpointError, match="model.ckpt cannot be read: the checksum of .* is wrong"):
+    with pytest.raises(CheckpointError, match=r"model\.ckpt cannot be read: the checksum of .* is wrong"):
         lidarfw.load(file)
 
 
@@ -185,7 +185,8 @@ def test_missing_plugin(file):
     with pytest.raises(CheckpointError) as error:
         lidarfw.load(file)
     assert str(error.value).startswith(
-        "this checkpoint uses head 'msrm' from lidarfw-msrm 0.1.0, which is not installed. Fix: pip install lidarfw-msrm"
+        "this checkpoint uses head 'msrm' from lidarfw-msrm 0.1.0, which is not installed. "
+        "Fix: pip install lidarfw-msrm"
     )
 
 
@@ -208,7 +209,8 @@ def test_other_architecture(file):
 
 @pytest.mark.parametrize(
     "change",
-    [lambda c: c["state_dict"].pop("model.head.toy.center.bias"), lambda c: c["state_dict"].update({"model.x": torch.ones(1)}),
+    [lambda c: c["state_dict"].pop("model.head.toy.center.bias"),
+     lambda c: c["state_dict"].update({"model.x": torch.ones(1)}),
      lambda c: c.pop("state_dict"), lambda c: c.update(state_dict=[1]), lambda c: c["lidarfw"].pop("config"),
      lambda c: c["lidarfw"].update(config="[1"), lambda c: c["lidarfw"].update(config="3"),
      lambda c: c["lidarfw"].update(data_spec={"inputs": 3}), lambda c: c["lidarfw"].update(format="x"),
@@ -217,7 +219,7 @@ def test_other_architecture(file):
 )  # fmt: skip
 def test_a_damaged_description_or_state(change, file):
     rewrite(file, change)
-    with pytest.raises(CheckpointError, match="model.ckpt"):
+    with pytest.raises(CheckpointError, match=r"model\.ckpt"):
         lidarfw.load(file)
 
 
@@ -258,7 +260,7 @@ def test_a_hostile_pickle_never_runs(payload, how, file, tmp_path, run):
         "init": lambda: run(tmp_path / "run", f"init={{from: {file}}}"),
         "evaluate": lambda: evaluate(file),
     }
-    with pytest.raises(CheckpointError, match="model.ckpt"):
+    with pytest.raises(CheckpointError, match=r"model\.ckpt"):
         ways.get(how, lambda: lidarfw.load(file))()
     assert not marker.exists()
 

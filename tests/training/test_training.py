@@ -148,7 +148,7 @@ def test_out_of_memory_says_what_to_do(run, tmp_path, monkeypatch):
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
 
     monkeypatch.setattr(training_parts.ToyLoss, "forward", exhausted)
-    with pytest.raises(TrainingError, match="out of memory at step 0, samples train0.*20.00 GiB") as error:
+    with pytest.raises(TrainingError, match=r"out of memory at step 0, samples train0.*20\.00 GiB") as error:
         run(tmp_path)
     assert "loader.batch_size" in str(error.value)
 
@@ -229,7 +229,8 @@ def test_overfitting_repeats_the_same_batches(run, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("override", "text"),
-    [("+optimizer.speed=3", "optimizer: AdamW: .*speed"), ("optimizer.lr=-1", "optimizer: AdamW: Invalid learning rate"),
+    [("+optimizer.speed=3", "optimizer: AdamW: .*speed"),
+     ("optimizer.lr=-1", "optimizer: AdamW: Invalid learning rate"),
      ("+scheduler.foo=1", "scheduler: OneCycleLR: .*foo"), ("trainer.devices=-5", "trainer: "),
      ("balance=magic", "balance is 'magic'"), ("init={to: x}", "init takes"),
      ("trainer.max_epochs=-1", "fix: trainer.max_epochs=N")],
