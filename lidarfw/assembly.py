@@ -1,11 +1,9 @@
 """From a config to a model: `plan` decides who feeds whom, `build` makes the components in that order.
 
-The rules (docs/concepts.md):
-1. The parameters of `forward` say what a component needs.
-2. `__init__` gets their Specs under the same names; its keyword-only arguments are the config.
-3. `self.provides` is the Spec of what comes out.
-4. A component sees what came before it. One that turns an X into an X replaces the X it took. Where two X are
-   still visible, `inputs: {parameter: component}` must choose.
+The four rules (docs/concepts.md): the parameters of `forward` say what a component needs; `__init__` gets their Specs
+under the same names, and its keyword-only arguments are the config; `self.provides` is the Spec of what comes out; a
+component sees what came before it, one that turns an X into an X replaces the X it took, and where two X are still
+visible, `inputs: {parameter: component}` must choose.
 
 `plan` reads declarations only: no torch, no weights, no data.
 """
@@ -109,7 +107,9 @@ class Plan:
 
 
 def _plain(config: Mapping[str, Any] | DictConfig) -> dict[str, Any]:
-    return to_plain(config) if isinstance(config, DictConfig) else dict(config.items())
+    if isinstance(config, DictConfig):
+        return to_plain(config)
+    return {**config}
 
 
 def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:

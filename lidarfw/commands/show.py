@@ -55,7 +55,7 @@ def table(plan: Plan, model: PerceptionModel) -> str:
 
 
 def _dataset(plan: Plan) -> str:
-    return "dataset." + next(iter(plan.config.get("dataset") or {"?": None}))
+    return f"dataset.{next(iter(plan.config.get('dataset') or {'?': None}))}"
 
 
 def _rows(step: Step, model: PerceptionModel) -> list[tuple[str, str, str, str]]:

@@ -14,7 +14,9 @@ class Site:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
-    def install(self, name: str, points: dict[str, dict[str, str]], files: dict[str, str], editable: Path | None = None):
+    def install(
+        self, name: str, points: dict[str, dict[str, str]], files: dict[str, str], editable: Path | None = None
+    ):
         """Write metadata with the entry points (group -> name -> value) and the modules."""
         info = self.folder / f"{name.replace('-', '_')}-1.0.dist-info"
         info.mkdir(parents=True)

@@ -29,7 +29,7 @@ def test_reading_declarations_does_not_import_torch():
         "print(len(found), 'torch' in sys.modules)"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert int(out[0]) >= len([c for c in COMPONENTS])
+    assert int(out[0]) >= len(COMPONENTS)
     assert out[1] == "False"
 
 

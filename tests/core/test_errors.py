@@ -43,7 +43,9 @@ def test_two_candidates_must_be_chosen_between(toys):
 
 def test_a_tap_without_its_head(toys):
     text = refused(toys, "train", "backbone=toy_pillars", "neck=[]", "head=peak", "loss=[peak,contrast]")
-    assert "loss.contrast needs localization: the BEV map of a head that predicts SceneCoords, and there is none" in text
+    assert (
+        "loss.contrast needs localization: the BEV map of a head that predicts SceneCoords, and there is none" in text
+    )
     assert "loss=[peak]" in text
 
 
