@@ -25,16 +25,8 @@ from lidarfw.ops.neighbors import ball_query, farthest_points, knn, three_interp
 from lidarfw.ops.nms import nms_circle, nms_rotated
 from lidarfw.ops.pose import kabsch, ransac_pose, transform
 from lidarfw.ops.range_image import range_knn, range_project, residual_images
-from lidarfw.ops.sparse_conv import (
-    SparseAvgPool3d,
-    SparseConv3d,
-    SparseInverseConv3d,
-    SparseMaxPool3d,
-    SparseSequential,
-    SubmanifoldConv3d,
-    from_dense,
-    to_dense,
-)
+from lidarfw.ops.sparse_conv import SparseConv3d, SparseInverseConv3d, SparseModule, SubmanifoldConv3d
+from lidarfw.ops.sparse_layers import SparseAvgPool3d, SparseMaxPool3d, SparseSequential, from_dense, fuse, to_dense
 
 __all__ = [
     "CellAssignment",
@@ -42,6 +34,7 @@ __all__ = [
     "SparseConv3d",
     "SparseInverseConv3d",
     "SparseMaxPool3d",
+    "SparseModule",
     "SparseSequential",
     "SubmanifoldConv3d",
     "assign_cells",
@@ -49,6 +42,7 @@ __all__ = [
     "box_corners",
     "farthest_points",
     "from_dense",
+    "fuse",
     "giou_3d",
     "group_points",
     "iou_3d",

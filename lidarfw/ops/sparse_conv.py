@@ -23,7 +23,7 @@ from torch.nn import functional as F
 from lidarfw.errors import LidarfwError
 from lidarfw.ops.rulebook import Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
 from lidarfw.ops.scratch import scratch
-from lidarfw.types import Grid, Voxels
+from lidarfw.types import Voxels
 
 
 def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
@@ -38,20 +38,20 @@ def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
         products = scratch("products", block.pairs, weight.shape[2], features)
         at = 0
         for inputs, _, element in block.groups:
-            rows = _gather(features, inputs, "rows")
+            rows = gather(features, inputs, "rows")
             torch.mm(rows, weights[element], out=products[at : at + len(inputs)])
             at += len(inputs)
-        _sum_block(block, products, output)
+        sum_block(block, products, output)
         if book.symmetric:
             output[block.rows].addmm_(features[block.rows], weights[book.volume // 2])
     return output
 
 
-def _gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
+def gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
     return torch.index_select(features, 0, rows, out=scratch(name, len(rows), features.shape[1], features))
 
 
-def _sum_block(block: Block, products: Tensor, output: Tensor) -> None:
+def sum_block(block: Block, products: Tensor, output: Tensor) -> None:
     """Write the sums of the products (pairs, C) to the block's rows of the output."""
     if block.pairs:
         output[block.rows] = F.embedding_bag(block.order, products, block.starts, mode="sum", include_last_offset=True)
@@ -92,14 +92,14 @@ def _gradients(
         products = scratch("products", block.pairs, weight.shape[1], gradient)
         at = 0
         for inputs, outputs, element in block.groups:
-            rows = _gather(gradient, inputs, "rows")
+            rows = gather(gradient, inputs, "rows")
             if d_weight is not None:
-                d_weight[element].addmm_(_gather(features, outputs, "features").t(), rows)
+                d_weight[element].addmm_(gather(features, outputs, "features").t(), rows)
             if need_features:
                 torch.mm(rows, flipped[element], out=products[at : at + len(inputs)])
             at += len(inputs)
         if d_features is not None:
-            _sum_block(block, products, d_features)
+            sum_block(block, products, d_features)
     if book.symmetric:
         centre = book.volume // 2
         if d_features is not None:
@@ -109,7 +109,7 @@ def _gradients(
     return d_features, d_weight
 
 
-def _triple(value: int | tuple[int, int, int]) -> Triple:
+def triple(value: int | tuple[int, int, int]) -> Triple:
     return (value, value, value) if isinstance(value, int) else (value[0], value[1], value[2])
 
 
@@ -125,16 +125,23 @@ def _compute_types(features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     return features, weight
 
 
-def _refuse_export() -> None:
-    if torch.compiler.is_compiling():
-        raise LidarfwError(
-            "sparse convolution cannot be exported or compiled: the number of its pairs depends on the scan.\n"
-            "  Export the dense part behind it (neck and heads, which take a BEV), and run the sparse backbone eagerly."
-        )
+class SparseModule(nn.Module):
+    """Base of the layers that take Voxels and give Voxels, so that `SparseSequential` knows them.
+
+    `torch.export` and ONNX, which cannot express them, are refused with advice.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Voxels:
+        if torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling():
+            raise LidarfwError(
+                f"{type(self).__name__} cannot be exported: how many pairs a sparse layer has depends on the scan.\n"
+                "  Export the dense part behind it (neck and heads, which take a BEV); run the sparse backbone eagerly."
+            )
+        return cast(Voxels, super().__call__(*args, **kwargs))
 
 
-class _SparseConvolution(nn.Module):
-    """Weights and geometry that all sparse convolutions share."""
+class SparseConvolution(SparseModule):
+    """Weights and geometry that the sparse convolutions share."""
 
     def __init__(self, in_channels: int, out_channels: int, kernel: Kernel, bias: bool) -> None:
         super().__init__()
@@ -163,10 +170,10 @@ class _SparseConvolution(nn.Module):
             )
         features, weight = _compute_types(features, self.weight)
         output = cast(Tensor, _Convolution.apply(features.contiguous(), weight, book))  # type: ignore[no-untyped-call]
-        return output if self.bias is None else output + self.bias.to(output.dtype)
+        return output if self.bias is None else output.add_(self.bias.to(output.dtype))
 
 
-class SubmanifoldConv3d(_SparseConvolution):
+class SubmanifoldConv3d(SparseConvolution):
     """Convolution whose output cells are its input cells; zero where no input lies.
 
     `kernel_size` and `dilation` are numbers or (z, y, x); the kernel must be odd.
@@ -180,18 +187,17 @@ class SubmanifoldConv3d(_SparseConvolution):
         dilation: int | tuple[int, int, int] = 1,
         bias: bool = False,
     ) -> None:
-        size, dilation = _triple(kernel_size), _triple(dilation)
+        size, dilation = triple(kernel_size), triple(dilation)
         if not all(k % 2 for k in size):
             raise ValueError(f"SubmanifoldConv3d: kernel_size must be odd to have a centre, got {size}")
         padding = (size[0] // 2 * dilation[0], size[1] // 2 * dilation[1], size[2] // 2 * dilation[2])
         super().__init__(in_channels, out_channels, Kernel(size, (1, 1, 1), padding, dilation), bias)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        _refuse_export()
         return voxels.with_features(self._apply_rulebook(voxels.features, submanifold_rulebook(voxels, self.kernel)))
 
 
-class SparseConv3d(_SparseConvolution):
+class SparseConv3d(SparseConvolution):
     """Convolution with a stride: an output cell exists where its kernel sees at least one input cell.
 
     The output shape is floor((n + 2 p - d (k - 1) - 1) / s) + 1 along each axis.
@@ -207,11 +213,10 @@ class SparseConv3d(_SparseConvolution):
         dilation: int | tuple[int, int, int] = 1,
         bias: bool = False,
     ) -> None:
-        kernel = Kernel(_triple(kernel_size), _triple(stride), _triple(padding), _triple(dilation))
+        kernel = Kernel(triple(kernel_size), triple(stride), triple(padding), triple(dilation))
         super().__init__(in_channels, out_channels, kernel, bias)
 
     def forward(self, voxels: Voxels) -> Voxels:
-        _refuse_export()
         book = strided_rulebook(voxels, self.kernel).book
         return strided_voxels(voxels, self.kernel, self._apply_rulebook(voxels.features, book))
 
@@ -224,7 +229,7 @@ def strided_voxels(voxels: Voxels, kernel: Kernel, features: Tensor) -> Voxels:
     return Voxels(features, made.index, voxels.grid, made.shape, strides, voxels.batch_size, made.cache)
 
 
-class SparseInverseConv3d(_SparseConvolution):
+class SparseInverseConv3d(SparseConvolution):
     """The transpose of a strided convolution: from its output cells back to its input cells.
 
     Give it the geometry of the `SparseConv3d` (or pooling) to undo; forward takes the coarse voxels and
@@ -241,7 +246,7 @@ class SparseInverseConv3d(_SparseConvolution):
         dilation: int | tuple[int, int, int] = 1,
         bias: bool = False,
     ) -> None:
-        kernel = Kernel(_triple(kernel_size), _triple(stride), _triple(padding), _triple(dilation))
+        kernel = Kernel(triple(kernel_size), triple(stride), triple(padding), triple(dilation))
         super().__init__(in_channels, out_channels, kernel, bias)
 
     def forward(self, voxels: Voxels, fine: Voxels) -> Voxels:
@@ -250,7 +255,6 @@ class SparseInverseConv3d(_SparseConvolution):
         Raises:
             ValueError: `voxels` are not the output cells of a layer of this geometry on `fine`.
         """
-        _refuse_export()
         made = strided_rulebook(fine, self.kernel)
         if made.index is not voxels.index and not torch.equal(made.index, voxels.index):
             raise ValueError(
@@ -258,88 +262,3 @@ class SparseInverseConv3d(_SparseConvolution):
                 f"{len(fine)} fine ones ({len(made.index)} cells); give it the geometry of the layer to undo"
             )
         return fine.with_features(self._apply_rulebook(voxels.features, made.book.transposed()))
-
-
-class _SparsePool3d(nn.Module):
-    def __init__(
-        self,
-        kernel_size: int | tuple[int, int, int],
-        stride: int | tuple[int, int, int] | None = None,
-        padding: int | tuple[int, int, int] = 0,
-    ) -> None:
-        super().__init__()
-        size = _triple(kernel_size)
-        self.kernel = Kernel(size, size if stride is None else _triple(stride), _triple(padding))
-
-    def extra_repr(self) -> str:
-        return f"kernel_size={self.kernel.size}, stride={self.kernel.stride}, padding={self.kernel.padding}"
-
-
-class SparseMaxPool3d(_SparsePool3d):
-    """Maximum over the cells that are there. `stride` defaults to the kernel size."""
-
-    def forward(self, voxels: Voxels) -> Voxels:
-        book = strided_rulebook(voxels, self.kernel).book
-        rows = voxels.features.index_select(0, book.inputs)
-        target = book.outputs.long()[:, None].expand_as(rows)
-        lowest = rows.new_full((book.num_outputs, rows.shape[1]), -torch.inf)
-        return strided_voxels(voxels, self.kernel, lowest.scatter_reduce(0, target, rows, "amax"))
-
-
-class SparseAvgPool3d(_SparsePool3d):
-    """Mean over the cells that are there. `stride` defaults to the kernel size."""
-
-    def forward(self, voxels: Voxels) -> Voxels:
-        book = strided_rulebook(voxels, self.kernel).book
-        summed = cast(Tensor, _PairSum.apply(voxels.features, book))  # type: ignore[no-untyped-call]
-        return strided_voxels(voxels, self.kernel, summed / book.pairs_per_output()[:, None].to(summed.dtype))
-
-
-class _PairSum(torch.autograd.Function):
-    """Sum of the inputs of every output, without weights."""
-
-    @staticmethod
-    def forward(ctx: Any, features: Tensor, book: Rulebook) -> Tensor:
-        ctx.book = book
-        return _pair_sum(features, book)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        return _pair_sum(gradient.contiguous(), ctx.book.transposed()), None
-
-
-def _pair_sum(features: Tensor, book: Rulebook) -> Tensor:
-    output = features.new_empty(book.num_outputs, features.shape[1])
-    for block in book.blocks():
-        inputs = torch.cat([inputs for inputs, _, _ in block.groups] or [book.inputs[:0]])
-        _sum_block(block, _gather(features, inputs, "products"), output)
-    return output
-
-
-class SparseSequential(nn.Sequential):
-    """A sequence of sparse layers (Voxels -> Voxels) and of plain modules, which see the features (N, C)."""
-
-    def forward(self, voxels: Voxels) -> Voxels:  # type: ignore[override]
-        for module in self:
-            if isinstance(module, (_SparseConvolution, _SparsePool3d, SparseSequential)):
-                voxels = module(voxels)
-            else:
-                voxels = voxels.with_features(module(voxels.features))
-        return voxels
-
-
-def to_dense(voxels: Voxels) -> Tensor:
-    """(B, C, D, H, W) map with zeros where no voxel lies."""
-    depth, height, width = voxels.shape
-    b, z, y, x = voxels.index.unbind(1)
-    dense = voxels.features.new_zeros(voxels.batch_size, depth, height, width, voxels.features.shape[1])
-    return dense.index_put((b, z, y, x), voxels.features).permute(0, 4, 1, 2, 3).contiguous()
-
-
-def from_dense(dense: Tensor, grid: Grid, strides: tuple[int, int, int] = (1, 1, 1)) -> Voxels:
-    """Voxels where any channel of dense (B, C, D, H, W) differs from zero."""
-    index = (dense.detach() != 0).any(1).nonzero()
-    b, z, y, x = index.unbind(1)
-    batch, _, depth, height, width = dense.shape
-    return Voxels(dense[b, :, z, y, x], index, grid, (depth, height, width), strides, batch)

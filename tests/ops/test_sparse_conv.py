@@ -15,9 +15,11 @@ from lidarfw.ops import (
     SparseConv3d,
     SparseInverseConv3d,
     SparseMaxPool3d,
+    SparseModule,
     SparseSequential,
     SubmanifoldConv3d,
     from_dense,
+    fuse,
     rulebook,
     to_dense,
 )
@@ -293,8 +295,9 @@ def test_export_says_what_to_do() -> None:
             return self.conv(Voxels(features, index, Grid((0, 0, 0), (8, 9, 7), (1, 1, 1)), (7, 9, 8))).features
 
     voxels = make_voxels(20, 3)
+    arguments = voxels.features.detach().float(), voxels.index
     with pytest.raises(LidarfwError, match="Export the dense part"):
-        torch.export.export(Wrapper(), (voxels.features.detach().float(), voxels.index), strict=False)
+        torch.export.export(Wrapper(), arguments, strict=False)
 
 
 def test_more_cells_than_an_int32_counts() -> None:
@@ -311,3 +314,28 @@ def test_more_cells_than_an_int32_counts() -> None:
     down = SparseConv3d(3, 4, 2, 2).double()(Voxels(features, far, grid, (2048, 2048, 2048)))
     assert down.index.max() >= 1000
     assert len(down) == 2 * len(SparseConv3d(3, 4, 2, 2).double()(voxels))
+
+
+def test_fused_for_inference_gives_the_same_and_leaves_the_original() -> None:
+    torch.manual_seed(0)
+    net, voxels = small_net().double(), make_voxels(200, 3, 2)
+    for _ in range(3):
+        net(voxels)  # running statistics that are not the initial ones
+    fused = fuse(net)
+    assert not any(isinstance(m, nn.BatchNorm1d) for m in fused.modules())
+    assert any(isinstance(m, nn.BatchNorm1d) for m in net.modules())
+    torch.testing.assert_close(fused(voxels).features, net.eval()(voxels).features)
+
+
+def test_sequence_takes_sparse_modules_of_others() -> None:
+    class Residual(SparseModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.conv = SubmanifoldConv3d(3, 3).double()
+
+        def forward(self, voxels: Voxels) -> Voxels:
+            return voxels.with_features(voxels.features + self.conv(voxels).features)
+
+    block, voxels = Residual(), make_voxels(50, 3)
+    expected = (voxels.features + block.conv(voxels).features).relu()
+    assert torch.equal(SparseSequential(block, nn.ReLU())(voxels).features, expected)
