@@ -131,12 +131,14 @@ class Camera:
     The camera frame is x right, y down, z ahead. Pixel coordinates are u right, v down, and whole numbers are
     pixel centres (as in OpenCV): the picture covers [-0.5, width - 0.5) x [-0.5, height - 0.5).
 
-    | model           | distortion             | source                                                        |
-    |-----------------|------------------------|---------------------------------------------------------------|
-    | pinhole         | k1, k2, p1, p2 (, k3)  | Brown-Conrady radial and tangential, as in OpenCV             |
-    | mei             | xi (, k1, k2, p1, p2)  | Mei and Rives, ICRA 2007: unit sphere seen from (0, 0, -xi)   |
-    | fisheye         | k1, k2, k3, k4         | Kannala and Brandt, PAMI 2006: polynomial of the angle        |
-    | equirectangular | none                   | u = fx * azimuth + cx, v = fy * (angle below horizon) + cy    |
+    ===============  =====================  ==============================================================
+    model            distortion             source
+    ===============  =====================  ==============================================================
+    pinhole          k1, k2, p1, p2 (, k3)  Brown-Conrady radial and tangential, as in OpenCV
+    mei              xi (, k1, k2, p1, p2)  Mei and Rives, ICRA 2007: unit sphere seen from (0, 0, -xi)
+    fisheye          k1, k2, k3, k4         Kannala and Brandt, PAMI 2006: polynomial of the angle
+    equirectangular  none                   u = fx * azimuth + cx, v = fy * (angle below the horizon) + cy
+    ===============  =====================  ==============================================================
 
     An empty `distortion` means none (mei needs xi), an empty `from_sensor` the identity.
     """
