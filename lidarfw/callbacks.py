@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 import signal
+import threading
 from collections.abc import Mapping
 from pathlib import Path
 from types import FrameType
@@ -111,8 +112,8 @@ class Checkpoints(Checkpoint):
 class Termination(Checkpoint):
     """On SIGTERM, ends the run with exit code 143, after the optimizer step at hand and a last.ckpt of it.
 
-    Outside of training (set-up, sanity check) it ends at once. A subclass of Checkpoint only so that Lightning runs
-    it after the other callbacks.
+    Outside of training (set-up, sanity check, test) it ends at once. A subclass of Checkpoint only so that Lightning
+    runs it after the other callbacks.
     """
 
     def __init__(self) -> None:
@@ -120,13 +121,20 @@ class Termination(Checkpoint):
         self._training = False
         self._before: Any = None
 
-    def install(self) -> None:
+    def __enter__(self) -> Termination:
         """Listen from now on."""
-        self._before = signal.signal(signal.SIGTERM, self._receive)
+        self._before = signal.getsignal(signal.SIGTERM)
+        self._listen()
+        return self
 
-    def uninstall(self) -> None:
+    def __exit__(self, *error: object) -> None:
         """Give the signal back to whom it belonged."""
-        signal.signal(signal.SIGTERM, self._before or signal.SIG_DFL)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._before or signal.SIG_DFL)
+
+    def _listen(self) -> None:
+        if threading.current_thread() is threading.main_thread():  # Python allows it nowhere else
+            signal.signal(signal.SIGTERM, self._receive)
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
@@ -135,11 +143,15 @@ class Termination(Checkpoint):
 
     def on_sanity_check_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Lightning has just put its own handler in, which ends with exit code 0: put ours back."""
-        signal.signal(signal.SIGTERM, self._receive)
+        self._listen()
+
+    def on_test_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Likewise."""
+        self._listen()
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """From here on there is something to save."""
-        signal.signal(signal.SIGTERM, self._receive)
+        self._listen()
         self._training = True
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *args: Any) -> None:

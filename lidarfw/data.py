@@ -262,7 +262,7 @@ class FrameLoader(DataLoader[Batch]):
         if sample.id in self.skipped:
             return
         self.skipped[sample.id] = sample.reason
-        count, total = len(self.skipped), sum(len(clip) for clip in self.samples.clips)
+        count, total = len(self.skipped), len(self.samples.dataset)
         rank_zero_warn(f"{count} of {total} skipped: sample {sample.id}: {sample.reason}")
         if count > max(1, MAX_SKIPPED * total):
             raise DataError(

@@ -27,7 +27,7 @@ from lidarfw.callbacks import Termination
 from lidarfw.config import instantiate, to_plain
 from lidarfw.data import DataModule
 from lidarfw.errors import CheckpointError, ConfigError, TrainingError
-from lidarfw.evaluation import evaluation_config
+from lidarfw.evaluation import MODEL_KEYS, evaluation_config
 from lidarfw.files import write_text
 from lidarfw.types import Batch, DataSpec, FrameResult
 
@@ -225,8 +225,33 @@ class PerceptionModule(pl.LightningModule):
         checkpoint["lidarfw"] = {**self.about, "figures": self.figures}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Know the figures of a validation before the interruption."""
-        self.figures = dict(checkpoint.get("lidarfw", {}).get("figures", {}))
+        """Check that it is of this model, and know the figures of the last validation."""
+        check_resumable(checkpoint, self)
+        self.figures = dict(checkpoint["lidarfw"].get("figures", {}))
+
+
+def check_resumable(content: Mapping[str, Any], module: PerceptionModule) -> None:
+    """CheckpointError with what differs, unless a checkpoint was written by a run of this model on these classes."""
+    about = checkpoint.description(content, "the checkpoint to resume from")
+    report = checkpoint.compare(module, content["state_dict"])
+    there, here = (spec["data_spec"]["classes"] for spec in (about, module.about))
+    if there == here and not (report.missing or report.skipped or report.mismatched):
+        return
+    stored, own = (checkpoint.config_of(spec, "the checkpoint to resume from") for spec in (about, module.about))
+    changes = [line for line in differences(stored, own) if line.startswith((*MODEL_KEYS, "dataset"))]
+    raise CheckpointError(
+        "cannot resume: the checkpoint is of another model.\n"
+        + "".join(f"  {line}\n" for line in changes[:5])
+        + f"{report}\n  fix: the same overrides as before, or start a new run from its weights, init={{from: PATH}}"
+    )
+
+
+def differences(there: Any, here: Any, key: str = "") -> list[str]:
+    """What two configs do not have in common, as "head.center.width: 64 there, 32 here"."""
+    if not (isinstance(there, dict) and isinstance(here, dict)):
+        return [] if there == here else [f"{key}: {there} there, {here} here"]
+    keys = list(dict.fromkeys([*there, *here]))
+    return [d for k in keys for d in differences(there.get(k), here.get(k), f"{key}.{k}".lstrip("."))]
 
 
 def parameter_groups(named: Iterable[tuple[str, nn.Parameter]], groups: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -274,9 +299,7 @@ def train(config: DictConfig) -> dict[str, float]:
     from lidarfw.assembly import build, plan
 
     _quieten()
-    stop = Termination()
-    stop.install()
-    try:
+    with Termination() as stop:
         folder = run_folder(config)
         wired = plan(config)
         for warning in wired.warnings:
@@ -290,8 +313,6 @@ def train(config: DictConfig) -> dict[str, float]:
         if trainer.is_global_zero:
             write_text(folder / "config.yaml", yaml.safe_dump(wired.config, sort_keys=False, allow_unicode=True))
         return _fit(trainer, module, data, _resume_from(config.resume, folder))
-    finally:
-        stop.uninstall()
 
 
 def _quieten() -> None:
@@ -417,8 +438,10 @@ def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float
     pl.seed_everything(config.seed, verbose=False)
     model = build(wired)
     checkpoint.restore(model, content, path)
-    trainer = make_trainer(config, Path(path).parent)
-    trainer.test(_module(model, to_plain(config), about), datamodule=DataModule.from_config(config), verbose=False)
+    module = _module(model, to_plain(config), about)
+    with Termination() as stop:
+        trainer = make_trainer(config, Path(path).parent, [stop])
+        trainer.test(module, datamodule=DataModule.from_config(config), verbose=False)
     return {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()}
 
 

@@ -196,3 +196,21 @@ def test_leftovers_of_a_killed_save_are_cleared(run, tmp_path):
     leftover.write_bytes(b"half")
     run(tmp_path, "trainer.max_epochs=1")
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [("backbone.toy.width=16", "backbone.toy.width: 8 there, 16 here"),
+     ("dataset.toy.classes=[b,a]", r"dataset.toy.classes: \['a', 'b'\] there, \['b', 'a'\] here"),
+     ("balance=uncertainty", "balance: fixed there, uncertainty here")],
+)  # fmt: skip
+def test_resuming_another_model_is_refused_with_what_differs(override, text, run, tmp_path):
+    run(tmp_path, "trainer.max_epochs=1")
+    with pytest.raises(CheckpointError, match=text):
+        run(tmp_path, override, "resume=auto")
+
+
+def test_resuming_a_foreign_checkpoint_is_refused(run, tmp_path):
+    torch.save({"state_dict": {}, "pytorch-lightning_version": "2.6.6"}, tmp_path / "foreign.ckpt")
+    with pytest.raises(CheckpointError, match="no key 'lidarfw'"):
+        run(tmp_path, f"resume={tmp_path / 'foreign.ckpt'}")
