@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -109,7 +109,7 @@ class Plan:
 def _plain(config: Mapping[str, Any] | DictConfig) -> dict[str, Any]:
     if isinstance(config, DictConfig):
         return to_plain(config)
-    return {**config}
+    return dict(cast(Mapping[str, Any], config))
 
 
 def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:
