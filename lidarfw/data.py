@@ -224,22 +224,27 @@ class FrameLoader(DataLoader[Batch]):
         self.order.start = self.position = position if epoch == self.order.epoch else 0
         batches = super().__iter__()
         for place in range(self.position, len(self)):
-            loaded = self._next(batches, place)
+            loaded = self._next(batches)
             self._judge(loaded.bad)
             self.position = place + 1
             if loaded.batch is not None:
                 yield loaded.batch
 
-    def _next(self, batches: Iterator[Any], place: int) -> Loaded:
+    def _next(self, batches: Iterator[Any]) -> Loaded:
         try:
             return next(batches)  # type: ignore[no-any-return]
         except LidarfwError as error:
             raise type(error)(_last_lines(error)) from error
         except (RuntimeError, OSError, EOFError, MemoryError) as error:
-            raise self._failure(error, place) from error
+            raise self.failure(error) from error
 
-    def _failure(self, error: Exception, place: int) -> DataError:
-        near = f"  the batch that was waited for: {self.samples.names(self.order.batch(place))}\n"
+    def failure(self, error: Exception) -> DataError:
+        """What it means that workers failed while the next batch was prepared. Ends the others."""
+        if self._iterator is not None:  # else torch raises again, wherever the program is, when it hears of the death
+            self._iterator._shutdown_workers()  # type: ignore[attr-defined]
+            self._iterator = None
+        keys = self.order.batch(self.position)
+        near = f"  the batch that was waited for: {self.samples.names(keys) or 'none'}\n"
         if "timed out" in str(error):
             return DataError(
                 f"no batch came within {self.timeout:g} s from {self.num_workers} loader workers.\n{near}"
@@ -359,6 +364,12 @@ class DataModule(pl.LightningDataModule):
             loader.load_state_dict(self._resume)
         self._resume, self._train_loader = None, loader
         return loader
+
+    def failure(self, error: RuntimeError) -> DataError | None:
+        """What an error means that torch raised in the midst of other work, because a training worker died."""
+        if self._train_loader is None or "DataLoader worker" not in str(error):
+            return None
+        return self._train_loader.failure(error)
 
     def state_dict(self) -> dict[str, Any]:
         """Where the training data stands; part of every checkpoint."""

@@ -342,6 +342,11 @@ def _fit(trainer: pl.Trainer, module: PerceptionModule, data: DataModule, resume
         trainer.fit(module, datamodule=data, ckpt_path=resume, weights_only=True)
     except (torch.OutOfMemoryError, MemoryError) as error:
         raise _out_of_memory(error, module) from error
+    except RuntimeError as error:
+        told = data.failure(error)
+        if told is None:
+            raise
+        raise told from error
     except MisconfigurationException as error:
         raise ConfigError(f"trainer: {error}") from error
     return {**module.figures, **{name: float(value) for name, value in trainer.callback_metrics.items()}}

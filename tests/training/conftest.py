@@ -1,23 +1,17 @@
-"""Runs of the tiny detector, in this process or in forked ones that may be killed."""
+"""The tiny detector, registered for every test of this folder."""
 
-import multiprocessing
-import os
 import sys
-import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
-from omegaconf import DictConfig, OmegaConf
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 import training_parts
+import training_runs
 
 from lidarfw import registry
-from lidarfw.config import compose
 from lidarfw.training import train
 
 
@@ -27,58 +21,7 @@ def toy_components() -> Iterator[None]:
         yield
 
 
-def settings(folder: Path, *overrides: str) -> DictConfig:
-    config = compose([*training_parts.OVERRIDES, *overrides])
-    OmegaConf.set_struct(config, False)
-    config.run_dir = str(folder)
-    return config
-
-
 @pytest.fixture
 def run() -> Callable[..., dict[str, float]]:
     """`run(folder, *overrides)` trains the tiny detector and gives its figures."""
-    return lambda folder, *overrides: train(settings(folder, *overrides))
-
-
-def weights(folder: Path, name: str = "last") -> dict[str, torch.Tensor]:
-    return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)["state_dict"]
-
-
-def assert_same_weights(one: Path, other: Path) -> None:
-    first, second = weights(one), weights(other)
-    assert first.keys() == second.keys()
-    different = {n: float((v - second[n]).abs().max()) for n, v in first.items() if not torch.equal(v, second[n])}
-    assert not different
-
-
-class Child:
-    """A forked run: its exit code is 0, 1 (any error, printed), or what it exits with."""
-
-    def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
-        self.process = multiprocessing.get_context("fork").Process(target=self._main, args=(function, *arguments))
-        self.process.start()
-
-    @staticmethod
-    def _main(function: Callable[..., Any], *arguments: Any) -> None:
-        try:
-            function(*arguments)
-        except SystemExit as error:
-            os._exit(error.code if isinstance(error.code, int) else 1)
-        except BaseException:
-            traceback.print_exc()
-            os._exit(1)
-        os._exit(0)
-
-    def signal(self, number: int) -> None:
-        assert self.process.pid is not None
-        os.kill(self.process.pid, number)
-
-    def wait(self, seconds: float = 60) -> int:
-        self.process.join(seconds)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
-            pytest.fail(f"the run did not end within {seconds} s")
-        code = self.process.exitcode
-        assert code is not None
-        return code
+    return lambda folder, *overrides: train(training_runs.settings(folder, *overrides))

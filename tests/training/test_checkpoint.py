@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import Child, settings
+from training_runs import Child, settings
 
 import lidarfw
 from lidarfw import checkpoint

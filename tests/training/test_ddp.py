@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import assert_same_weights, settings
+from training_runs import assert_same_weights, settings
 
 from lidarfw import callbacks
 from lidarfw.training import evaluate, train

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import Child, assert_same_weights, settings
+from training_runs import Child, assert_same_weights, settings
 
 import lidarfw
 from lidarfw import callbacks

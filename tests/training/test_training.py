@@ -2,15 +2,18 @@
 
 import csv
 import math
+import os
+import signal
+import time
 
 import pytest
 import torch
 import training_parts
-from conftest import assert_same_weights, settings, weights
+from training_runs import assert_same_weights, settings, weights
 
 import lidarfw
 from lidarfw import registry
-from lidarfw.errors import ConfigError, TrainingError
+from lidarfw.errors import ConfigError, DataError, TrainingError
 from lidarfw.training import PerceptionModule, UncertaintyBalance, parameter_groups
 
 LONG = ["trainer.max_epochs=40", "transform=[]", "dataset.toy.frames=16", "loader.batch_size=8", "optimizer.lr=0.05",
@@ -141,6 +144,21 @@ def test_a_gradient_that_is_not_finite_stops_before_the_step(run, tmp_path, monk
 def test_a_broken_input_is_named(run, tmp_path):
     with pytest.raises(TrainingError, match=r"loss toy/center is nan, toy/class is nan .* train003"):
         run(tmp_path, "dataset.toy.poison=3", "splits.val=null")
+
+
+def test_a_worker_that_dies_while_the_model_works(run, tmp_path, monkeypatch):
+    step = PerceptionModule.training_step
+
+    def kill_worker(self, batch, batch_idx):
+        loader = self.trainer.datamodule._train_loader
+        os.kill(loader._iterator._workers[0].pid, signal.SIGKILL)
+        time.sleep(1)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(PerceptionModule, "training_step", kill_worker)
+    with pytest.raises(DataError, match=r"worker died: DataLoader worker .* is killed by signal") as error:
+        run(tmp_path, "loader.workers=1")
+    assert "the batch that was waited for: train" in str(error.value)
 
 
 def test_out_of_memory_says_what_to_do(run, tmp_path, monkeypatch):
