@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ import pytest
 from lidarfw import assembly, config, registry
 from lidarfw.cli import main
 from lidarfw.interfaces import SLOTS
-from lidarfw.testing.checks import cases
+from lidarfw.testing.checks import CHECKS, cases
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -98,3 +99,21 @@ def test_a_folder_in_use_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["new", "acme-lidar", "--slot", "neck", "-o", str(tmp_path)]) == 2
     assert "exists and is not empty" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["precious"]
+
+
+def test_the_guide_shows_what_new_writes(tmp_path: Path) -> None:
+    """Every python, toml and yaml block of the guide stands in the files of the plugin that it makes."""
+    guide = (ROOT / "docs" / "write-a-plugin.md").read_text(encoding="utf-8")
+    command = re.search(r"^\$ lidarfw (new .*)$", guide, re.MULTILINE)
+    assert command is not None
+    assert main([*command[1].split(), "-o", str(tmp_path / "plugin")]) == 0
+    files = {
+        p.relative_to(tmp_path / "plugin").as_posix(): p.read_text()
+        for p in (tmp_path / "plugin").rglob("*.*")
+        if p.is_file()
+    }
+    blocks = re.findall(r"^```(?:python|toml|yaml)\n(.*?)^```$", guide, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 7
+    assert [block for block in blocks if not any(block in text for text in files.values())] == []
+    named = re.findall(r"^\| `([\w/.]+)` \|", guide, re.MULTILINE)
+    assert set(named) - {check.name for check in CHECKS} <= set(files)

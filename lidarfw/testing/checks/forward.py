@@ -32,7 +32,7 @@ def provides_what_it_says(subject: Subject) -> None:
 
 @check(*MODULES)
 def works_without_optional_inputs(subject: Subject) -> None:
-    """Parameters `X | None` may be absent."""
+    """Optional parameters may be absent."""
     if not any(p.optional for p in subject.parameters):
         return
     built = build(subject, optional=False)
@@ -87,10 +87,13 @@ def works_on_almost_nothing(subject: Subject) -> None:
         require(finite(built.run(frames, training=True)), f"{what}: not finite in training")
 
 
-@check(*MODULES)
+@check(*MODULES, "tracker")
 def gradients_reach_every_parameter(subject: Subject) -> None:
-    """Every parameter gets a finite gradient from what comes out."""
+    """Every parameter gets a finite gradient from what `forward` gives."""
     built = build(subject)
+    if subject.slot == "tracker" and subject.declared.trainable is None:
+        require(not list(built.module.parameters()), "it has parameters but no forward to train them")
+        return
     _require_gradients(built, floats(built.run(street()[:2], training=True)))
 
 

@@ -100,11 +100,17 @@ def gradients_are_finite(subject: Subject) -> None:
 def figures_are_finite_floats(subject: Subject) -> None:
     """`compute` gives finite floats, `monitor` among them, also for no frame, an empty frame and an unlabelled one."""
     frame = street()[0]
-    for what, frames in (("no frame", []), ("an empty frame", [empty(frame)]), ("frames", list(street()[:2]))):
+    unlabelled = frame.replace(targets=NOTHING, meta=frame.meta)
+    for what, frames in (
+        ("no frame", []),
+        ("an empty frame", [empty(frame)]),
+        ("an unlabelled frame", [unlabelled]),
+        ("labelled frames", list(street()[:2])),
+    ):
         figures = _figures(subject, frames)
         monitor = subject.cls.monitor
-        if frames and what == "frames":
-            require(monitor in figures, f"monitor {monitor!r} is not among the figures {sorted(figures)}")
+        known = monitor in figures or what != "labelled frames"
+        require(known, f"monitor {monitor!r} is not among the figures {sorted(figures)}")
         bad = [name for name, value in figures.items() if not math.isfinite(value)]
         require(not bad, f"{what}: {', '.join(bad)} is not finite")
 
@@ -134,8 +140,9 @@ def _truth(kind: Any, frames: list[Any]) -> Any:
 
 def _figures(subject: Subject, frames: list[Any]) -> dict[str, float]:
     built = build(subject)
-    for frame in frames:
-        arguments = {name: None if s is None else example(s, [frame], name) for name, s in built.specs.items()}
+    for frame, labelled in zip(frames, street(), strict=False):
+        scene = labelled if frame.targets.boxes is None else frame  # made-up detections start from the objects
+        arguments = {name: None if s is None else example(s, [scene], name) for name, s in built.specs.items()}
         special = {n: targets([frame]) if n == "targets" else [frame.meta] for n in subject.declared.special}
         built.module.update(**arguments, **special)
     with warnings.catch_warnings():

@@ -103,10 +103,12 @@ class Built:
         """Made-up inputs of its forward for the frames."""
         from lidarfw.testing import examples
 
-        found = {p.name: self._argument(p, frames, training) for p in self.subject.declared.takes}
-        if "targets" in self.subject.declared.special:
+        declared = self.subject.declared
+        takes = declared.trainable or () if self.subject.slot == "tracker" else declared.takes
+        found = {p.name: self._argument(p, frames, training) for p in takes}
+        if "targets" in declared.special:
             found["targets"] = examples.targets(frames) if training or self.subject.slot == "loss" else None
-        if "meta" in self.subject.declared.special:
+        if "meta" in declared.special:
             found["meta"] = [frame.meta for frame in frames]
         return found
 
