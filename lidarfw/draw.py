@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from lidarfw.errors import DataError
 from lidarfw.files import atomic_path
 from lidarfw.ops import box_corners
-from lidarfw.types import Boxes, Camera, Points, RangeImage, Tracks
+from lidarfw.types import Boxes, Camera, PointLabels, Points, RangeImage, Tracks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,6 +64,7 @@ def birds_eye(
     truth: Boxes | None = None,
     classes: Sequence[str] = (),
     *,
+    labels: PointLabels | None = None,
     colour: str = "height",
     extent: Extent | None = None,
     title: str = "",
@@ -75,19 +77,24 @@ def birds_eye(
             their number.
         truth: boxes of the ground truth, dashed black.
         classes: names, by label.
+        labels: a class for every point, drawn in its colour instead of `colour`; unlabelled points are grey.
         extent: what to show; by default everything but the farthest 1 % of the points.
         title: a line above.
     """
     figure, axes = _bev_axes(extent or _extent(points, [_boxes(found), truth]))
     if points is not None and len(points):
-        _scatter(figure, axes, points, colour)
+        if labels is not None:
+            _scatter_classes(axes, points, labels)
+        else:
+            _scatter(figure, axes, points, colour)
     if truth is not None:
         _outlines(axes, truth, [_TRUTH] * len(truth), linestyle=(0, (4, 2)), linewidth=1.0, zorder=4)
     boxes = _boxes(found)
     if boxes is not None:
         _outlines(axes, boxes, [colour_of(int(label)) for label in boxes.label], linewidth=1.5, zorder=5)
         _write_labels(axes, boxes, _captions(found))
-    _legend(axes, boxes, truth, classes)
+    shown = boxes if boxes is not None else labels
+    _legend(axes, None if shown is None else shown.label, truth, classes)
     axes.set_title(title, loc="left", fontsize=10)
     return _render(figure)
 
@@ -155,10 +162,9 @@ def _scatter(figure: Figure, axes: Axes, points: Points, colour: str) -> None:
     values = xyz[:, 2] if by_height else points.features[:, 0].detach().cpu().numpy()
     low, high = np.percentile(values, [2, 98]) if by_height else (0.0, max(float(np.percentile(values, 99)), 1e-3))
     order = np.argsort(values)
-    size = float(np.clip(5e4 / len(xyz), 0.5, 4))
     cloud = axes.scatter(
-        xyz[order, 1], xyz[order, 0], c=values[order], s=size, cmap="viridis", vmin=low, vmax=high, linewidths=0,
-        alpha=0.8, zorder=2,
+        xyz[order, 1], xyz[order, 0], c=values[order], s=_dot(len(xyz)), cmap="viridis", vmin=low, vmax=high,
+        linewidths=0, alpha=0.8, zorder=2,
     )  # fmt: skip
     box = axes.get_position()
     inch = 1 / figure.get_figwidth()
@@ -166,6 +172,19 @@ def _scatter(figure: Figure, axes: Axes, points: Points, colour: str) -> None:
     bar_axes = figure.add_axes((box.x1 + 0.2 * inch, box.y0, 0.1 * inch, height))
     figure.colorbar(cloud, cax=bar_axes).set_label("height (m)" if by_height else "intensity", fontsize=8)
     bar_axes.tick_params(labelsize=7)
+
+
+def _scatter_classes(axes: Axes, points: Points, labels: PointLabels) -> None:
+    xyz, label = points.xyz.detach().cpu().numpy(), labels.label.cpu()
+    for value in np.unique(label.numpy()).tolist():
+        chosen = (label == value).numpy()
+        colour, order = (colour_of(value), 3) if value >= 0 else ("#BBBBBB", 2)
+        axes.scatter(xyz[chosen, 1], xyz[chosen, 0], c=colour, s=_dot(len(xyz)), linewidths=0, zorder=order)
+
+
+def _dot(count: int) -> float:
+    """Area of a point in square points of print: smaller in dense scans."""
+    return float(np.clip(5e4 / count, 0.5, 4))
 
 
 def _outlines(axes: Axes, boxes: Boxes, colours: Sequence[str], zorder: float, **style: Any) -> None:
@@ -197,11 +216,12 @@ def _write_labels(axes: Axes, boxes: Boxes, captions: Sequence[str]) -> None:
         )  # fmt: skip
 
 
-def _legend(axes: Axes, boxes: Boxes | None, truth: Boxes | None, classes: Sequence[str]) -> None:
+def _legend(axes: Axes, labels: Tensor | None, truth: Boxes | None, classes: Sequence[str]) -> None:
+    """Colour and count of every class among the labels (N,), and of the truth."""
     from matplotlib.lines import Line2D
 
     handles = []
-    counts = boxes.label.bincount(minlength=len(classes)).tolist() if boxes is not None else []
+    counts = labels[labels >= 0].bincount(minlength=len(classes)).tolist() if labels is not None else []
     for label, count in enumerate(counts):
         name = classes[label] if label < len(classes) else f"class {label}"
         handles.append(Line2D([], [], color=colour_of(label), linewidth=2, label=f"{name} ({count})"))
@@ -270,7 +290,7 @@ def _projected(boxes: Boxes, camera: Camera) -> list[tuple[list[np.ndarray], np.
     ]
 
 
-def _cut_near(start: torch.Tensor, end: torch.Tensor, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def _cut_near(start: Tensor, end: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Edges (M, 12, 3) cut at the near plane; those wholly behind stay behind."""
     shape = start.shape
     z0, z1 = (camera.to_camera(p.reshape(-1, 3))[:, 2].reshape(*shape[:2], 1) for p in (start, end))

@@ -332,7 +332,8 @@ def pictures_of(result: FrameResult, classes: Sequence[str]) -> dict[str, draw.P
     pictures = {}
     scan = next((value for value in result.inputs.values() if isinstance(value, Points)), None)
     if scan is not None:
-        pictures["bev"] = draw.birds_eye(scan, found, truth, classes, title=result.meta.id)
+        labels = next((value for value in result.predictions.values() if isinstance(value, PointLabels)), None)
+        pictures["bev"] = draw.birds_eye(scan, found, truth, classes, labels=labels, title=result.meta.id)
     camera = result.meta.cameras.get(kitti.IMAGE)
     picture = _picture_of(result)
     if camera is not None and picture is not None and found is not None:

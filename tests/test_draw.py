@@ -13,7 +13,7 @@ import torch
 
 from lidarfw import draw
 from lidarfw.errors import DataError
-from lidarfw.types import Boxes, Camera, Points, RangeImage, RangeView, Tracks
+from lidarfw.types import Boxes, Camera, PointLabels, Points, RangeImage, RangeView, Tracks
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 TURN = ((0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -96,6 +96,15 @@ def test_colour_by_intensity_and_unknown_colour() -> None:
     assert (draw.birds_eye(scan(), colour="intensity") != draw.birds_eye(scan())).any()
     with pytest.raises(ValueError, match="height or intensity"):
         draw.birds_eye(scan(), colour="smell")
+
+
+def test_points_by_class_and_grey_where_unlabelled(place: Callable[[float, float], np.ndarray]) -> None:
+    xyz = torch.tensor([[10.0, 10, 0], [-10, 10, 0], [0, -10, 0]])
+    points = Points.from_scan(xyz, torch.zeros(3, 0))
+    labels = PointLabels(torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, 0, 0]]), points.batch)
+    picture = draw.birds_eye(points, None, None, CLASSES, labels=labels, extent=EXTENT)
+    for (x, y, _), colour in zip(xyz.tolist(), (draw.colour_of(0), draw.colour_of(2), "#BBBBBB"), strict=True):
+        assert near(pixels(picture, colour, 40), place(x, y))
 
 
 # Camera

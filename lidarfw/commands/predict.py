@@ -41,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
     model = lidarfw.load(Path(args.checkpoint)).to("cuda" if torch.cuda.is_available() else "cpu")
     reader = predict.FrameReader(model, args.columns, args.repair, args.intensity_max)
     sources = predict.find_sources(args.scans, reader.lidar, args.calib, args.image)
+    if model.plan.data.sweeps > 1:
+        print(f"note: the model learned from {model.plan.data.sweeps} scans per frame, here each frame is one scan")
     classes, folder = model.plan.data.classes, Path(args.output)
     rows = []
     begin = time.perf_counter()
