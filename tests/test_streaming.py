@@ -13,8 +13,11 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from lidarfw.assembly import build, plan
+from lidarfw.config import compose
 from lidarfw.errors import CheckpointError
 from lidarfw.interfaces import Filter, Tracker
+from lidarfw.model import PerceptionModel
 from lidarfw.plain import from_plain, to_plain
 from lidarfw.streaming import Stream
 from lidarfw.testing.synthetic import frames
@@ -192,3 +195,33 @@ def test_plain_types_refuse_what_could_run_code() -> None:
         to_plain({"call": lambda: None})
     with pytest.raises(CheckpointError, match="'Popen'"):
         from_plain({"type": "Popen", "fields": {"args": "true"}})
+
+
+@pytest.fixture(scope="module")
+def model() -> PerceptionModel:
+    """The default detector, small, with a filter and a tracker that uses the poses."""
+    near = ["backbone.pillars.lower=[0,-16,-3]", "backbone.pillars.upper=[32,16,1]"]
+    chosen = ["filter=score", "filter.score.default_score=0.1", "tracker=greedy", "dataset.synthetic.pose=true"]
+    torch.manual_seed(0)
+    return build(plan(compose([*near, *chosen]))).eval()
+
+
+def test_a_model_streams_with_its_filter_and_tracker(model: PerceptionModel) -> None:
+    sequence = frames(4, points=1024, pose=True)
+    whole, first, second = (model.stream() for _ in range(3))
+    expected = run(whole, sequence) + whole.flush()
+    assert [r.meta.id for r in expected] == [f.meta.id for f in sequence]
+    assert sum(len(r.of(Boxes)) for r in expected) > 10
+    for result in expected:
+        assert result.tracks is not None
+        assert len(result.tracks.id.unique()) == len(result.of(Boxes)) == len(result.tracks.boxes)
+        assert (result.of(Boxes).score >= 0.1).all()
+    head = run(first, sequence[:2])
+    second.load_state_dict(first.state_dict())
+    assert facts(head + run(second, sequence[2:])) == facts(expected)
+
+
+def test_the_weights_of_a_model_do_not_change_in_a_stream(model: PerceptionModel) -> None:
+    before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    run(model.stream(), frames(2, points=1024, pose=True))
+    assert all(torch.equal(before[name], tensor) for name, tensor in model.state_dict().items())
