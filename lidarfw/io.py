@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,16 +146,14 @@ def _read_npy(path: Path, data: bytes) -> Scan:
 
     try:
         loaded = np.load(io.BytesIO(data), allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            return _from_table(path, loaded)
-        arrays = {name: loaded[name] for name in loaded.files}
-    except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
+        arrays = {"points": loaded} if isinstance(loaded, np.ndarray) else {n: loaded[n] for n in loaded.files}
+    except Exception as error:  # numpy's header parser, zipfile and zlib raise a dozen kinds on broken bytes
         raise DataError(f"{path}: is not a readable {path.suffix} file: {error}") from error
-    tables = {name: array for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3}
-    if "points" not in tables and len(tables) != 1:
+    tables = [name for name, array in arrays.items() if array.ndim == 2 and array.shape[1] >= 3]
+    if "points" not in arrays and len(tables) != 1:
         found = ", ".join(f"{name} {array.shape}" for name, array in arrays.items()) or "nothing"
         raise DataError(f"{path}: expected an array `points` of shape (N, 3 or more), found {found}")
-    return _from_table(path, tables["points"] if "points" in tables else next(iter(tables.values())))
+    return _from_table(path, arrays["points" if "points" in arrays else tables[0]])
 
 
 def _read_pcd(path: Path, data: bytes) -> Scan:

@@ -92,12 +92,16 @@ FORMATS = ["bin", "pcd_ascii", "pcd_binary", "pcd_compressed", *PLY]
 
 
 def save(folder: Path, name: str, points: np.ndarray = POINTS) -> Path:
+    if name in ("npy", "npz"):
+        path = folder / f"scan.{name}"
+        np.save(path, points) if name == "npy" else np.savez_compressed(path, points=points)
+        return path
     file, content = encode(points, name)
     (folder / file).write_bytes(content)
     return folder / file
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", [*FORMATS, "npy", "npz"])
 @pytest.mark.parametrize("count", [1, 100])
 def test_every_format_gives_the_same_numbers(tmp_path: Path, name: str, count: int) -> None:
     scan = read_points(save(tmp_path, name, POINTS[:count]))
@@ -113,11 +117,9 @@ def test_repetitive_data_is_unpacked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points(save(tmp_path, "pcd_compressed", points)).xyz, points[:, :3])
 
 
-@pytest.mark.parametrize("suffix", [".npy", ".npz"])
-def test_numpy_files(tmp_path: Path, suffix: str) -> None:
-    path = tmp_path / f"scan{suffix}"
-    np.save(path, POINTS) if suffix == ".npy" else np.savez(path, points=POINTS, other=np.zeros((4, 4)))
-    np.testing.assert_array_equal(read_points(path).xyz, POINTS[:, :3])
+def test_an_archive_of_several_arrays_is_read_by_name(tmp_path: Path) -> None:
+    np.savez(tmp_path / "scan.npz", other=np.zeros((4, 4)), points=POINTS)
+    np.testing.assert_array_equal(read_points(tmp_path / "scan.npz").xyz, POINTS[:, :3])
 
 
 def test_structured_numpy_goes_by_names(tmp_path: Path) -> None:
@@ -186,7 +188,7 @@ def test_a_file_cut_at_any_place_is_an_error(tmp_path: Path, name: str) -> None:
             read_points(path)
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", [*FORMATS, "npy", "npz"])
 def test_random_damage_is_an_error_or_gives_finite_points(tmp_path: Path, name: str) -> None:
     path = save(tmp_path, name)
     whole, rng = bytearray(path.read_bytes()), np.random.default_rng(2)
