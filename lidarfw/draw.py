@@ -95,7 +95,7 @@ def birds_eye(
         _write_labels(axes, boxes, _captions(found))
     shown = boxes if boxes is not None else labels
     _legend(axes, None if shown is None else shown.label, truth, classes)
-    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_title(title, loc="left", fontsize=12)
     return _render(figure)
 
 
@@ -141,13 +141,15 @@ def _bev_axes(extent: Extent) -> tuple[Figure, Axes]:
     x0, x1, y0, y1 = extent
     scale = min(9 / (x1 - x0), 11 / (y1 - y0))
     width, height = (y1 - y0) * scale, (x1 - x0) * scale
-    left, right, bottom, top = 0.6, 1.75, 0.5, 0.35
+    left, right, bottom, top = 0.7, 2.2, 0.6, 0.4
     whole = (left + width + right, bottom + height + top)
     figure = _figure(*whole)
     axes = figure.add_axes((left / whole[0], bottom / whole[1], width / whole[0], height / whole[1]))
-    axes.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y (m)", ylabel="x (m)", facecolor="#FBFBFA")
+    axes.set(xlim=(y1, y0), ylim=(x0, x1), facecolor="#FBFBFA")
+    axes.set_xlabel("y (m)", fontsize=11)
+    axes.set_ylabel("x (m)", fontsize=11)
     axes.grid(True, color="#DDDDDD", linewidth=0.6)
-    axes.tick_params(labelsize=8)
+    axes.tick_params(labelsize=10)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
     axes.plot(0, 0, marker=(3, 0, 0), markersize=9, color="#000000", zorder=6)
@@ -170,8 +172,8 @@ def _scatter(figure: Figure, axes: Axes, points: Points, colour: str) -> None:
     inch = 1 / figure.get_figwidth()
     height = min(box.height * 0.45, 2.2 / figure.get_figheight())
     bar_axes = figure.add_axes((box.x1 + 0.2 * inch, box.y0, 0.1 * inch, height))
-    figure.colorbar(cloud, cax=bar_axes).set_label("height (m)" if by_height else "intensity", fontsize=8)
-    bar_axes.tick_params(labelsize=7)
+    figure.colorbar(cloud, cax=bar_axes).set_label("height (m)" if by_height else "intensity", fontsize=10)
+    bar_axes.tick_params(labelsize=9)
 
 
 def _scatter_classes(axes: Axes, points: Points, labels: PointLabels) -> None:
@@ -211,7 +213,7 @@ def _write_labels(axes: Axes, boxes: Boxes, captions: Sequence[str]) -> None:
         boxes.center.tolist(), reach.tolist(), boxes.label.tolist(), captions, strict=True
     ):
         axes.text(
-            y, x + radius, caption, fontsize=7, color=colour_of(label), ha="center", va="bottom", path_effects=halo,
+            y, x + radius, caption, fontsize=9, color=colour_of(label), ha="center", va="bottom", path_effects=halo,
             zorder=7, clip_on=True,
         )  # fmt: skip
 
@@ -230,7 +232,7 @@ def _legend(axes: Axes, labels: Tensor | None, truth: Boxes | None, classes: Seq
         handles.append(Line2D([], [], color=_TRUTH, linestyle=dashes, label=f"ground truth ({len(truth)})"))
     if handles:
         place: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
-        axes.legend(handles=handles, fontsize=8, frameon=False, **place)
+        axes.legend(handles=handles, fontsize=11, frameon=False, **place)
 
 
 # Camera view

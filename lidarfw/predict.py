@@ -19,7 +19,7 @@ from lidarfw.errors import DataError
 from lidarfw.files import atomic_path, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
 from lidarfw.model import PerceptionModel
-from lidarfw.types import Boxes, Camera, Frame, FrameMeta, FrameResult, Image, PointLabels, Points, Spec, Targets
+from lidarfw.types import Boxes, Camera, Frame, FrameMeta, FrameResult, Grid, Image, PointLabels, Points, Spec, Targets
 
 PERIOD = 0.1  # seconds between the scans of a folder, where nothing says otherwise
 FORMATS = ("json", "npz", "kitti")
@@ -316,24 +316,44 @@ def _arrays(result: FrameResult, classes: Sequence[str]) -> dict[str, np.ndarray
     return {**arrays, "classes": np.array(list(classes), dtype=np.str_)}
 
 
-def save_pictures(result: FrameResult, folder: Path, classes: Sequence[str]) -> list[Path]:
+def save_pictures(
+    result: FrameResult, folder: Path, classes: Sequence[str], extent: draw.Extent | None = None
+) -> list[Path]:
     """ID_bev.png with the scan from above, and ID_image.png where picture and calibration are known."""
-    pictures = pictures_of(result, classes)
+    pictures = pictures_of(result, classes, extent)
     paths = [folder / f"{result.meta.id}_{name}.png" for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
         draw.write_png(path, picture)
     return paths
 
 
-def pictures_of(result: FrameResult, classes: Sequence[str]) -> dict[str, draw.Picture]:
-    """Pictures of a result by name: bev, image. Truth is drawn where the result has it."""
+def extent_of(model: PerceptionModel) -> draw.Extent | None:
+    """The ground that the model looks at: that of its first grid; None where it has none."""
+    for step in [*model.plan.of("backbone"), *model.plan.of("neck")]:
+        provided = model.component(step).provides
+        for spec in _flat(provided):
+            if isinstance(spec.geometry, Grid):
+                (x0, y0, _), (x1, y1, _) = spec.geometry.lower, spec.geometry.upper
+                return x0, x1, y0, y1
+    return None
+
+
+def _flat(provided: Any) -> list[Spec]:
+    return [s for part in provided for s in _flat(part)] if isinstance(provided, (list, tuple)) else [provided]
+
+
+def pictures_of(
+    result: FrameResult, classes: Sequence[str], extent: draw.Extent | None = None
+) -> dict[str, draw.Picture]:
+    """Pictures of a result by name: bev (of `extent`, by default of all points), image. Truth is drawn where known."""
     found = result.tracks or _all_boxes(result)
     truth = result.targets.boxes if result.targets else None
     pictures = {}
     scan = next((value for value in result.inputs.values() if isinstance(value, Points)), None)
     if scan is not None:
         labels = next((value for value in result.predictions.values() if isinstance(value, PointLabels)), None)
-        pictures["bev"] = draw.birds_eye(scan, found, truth, classes, labels=labels, title=result.meta.id)
+        title = result.meta.id
+        pictures["bev"] = draw.birds_eye(scan, found, truth, classes, labels=labels, extent=extent, title=title)
     camera = result.meta.cameras.get(kitti.IMAGE)
     picture = _picture_of(result)
     if camera is not None and picture is not None and found is not None:

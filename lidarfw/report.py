@@ -11,6 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 import yaml
 
@@ -19,7 +20,7 @@ from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.checkpoint import load
 from lidarfw.errors import DataError
 from lidarfw.files import write_text
-from lidarfw.predict import keep_scores, pictures_of
+from lidarfw.predict import extent_of, keep_scores, pictures_of
 from lidarfw.types import FrameResult, collate
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def write_report(
     run_dir: str | Path,
     figures: Mapping[str, float] | None = None,
     *,
-    split: str = "val",
+    split: str | None = None,
     frames: int = 4,
     score: float = 0.3,
     seconds: Mapping[str, float] | None = None,
@@ -58,7 +59,7 @@ def write_report(
     Args:
         run_dir: folder of a `lidarfw train` run: checkpoints/, metrics.csv.
         figures: of an evaluation ("box_ap/car_3d_ap"); by default the last ones of metrics.csv.
-        split: whose frames are shown.
+        split: of the dataset, whose frames are shown; by default the one that the run was validated on.
         frames: how many of them, evenly spaced over the split.
         score: boxes below are not drawn.
         seconds: wall time by stage, shown where given.
@@ -66,6 +67,7 @@ def write_report(
     folder = Path(run_dir)
     path = _checkpoint(folder)
     model = load(path)
+    split = split or model.plan.config["splits"]["val"]
     metrics = folder / "metrics.csv"
     curves = draw.read_metrics(metrics) if metrics.exists() else {}
     figures = figures if figures is not None else _last_figures(curves)
@@ -150,8 +152,9 @@ def _tiles(model: PerceptionModel, figures: Mapping[str, float], seconds: Mappin
 
 def _frames(model: PerceptionModel, split: str, count: int, score: float) -> str:
     shown = []
+    extent = extent_of(model)
     for result in _results(model, split, count):
-        pictures = pictures_of(keep_scores(result, score), model.plan.data.classes)
+        pictures = pictures_of(keep_scores(result, score), model.plan.data.classes, extent)
         caption = f"{result.meta.id}: boxes with a score of {score:g} or more; truth "
         shown += [_image(p, caption + ("dashed" if name == "bev" else "in white")) for name, p in pictures.items()]
     return f"<div class=frames>{''.join(shown)}</div>" if shown else ""
@@ -160,10 +163,7 @@ def _frames(model: PerceptionModel, split: str, count: int, score: float) -> str
 @torch.no_grad()
 def _results(model: PerceptionModel, split: str, count: int) -> Iterator[FrameResult]:
     """Results of frames evenly spaced over a split, with their truth."""
-    import numpy as np
-
-    name = model.plan.config.get("splits", {}).get(split, split)
-    dataset = make_dataset(model.plan.config, name)
+    dataset = make_dataset(model.plan.config, split)
     transforms = make_transforms(model.plan.config, training=False)
     dataset.prepare()
     for index in sorted({round(i * (len(dataset) - 1) / max(count - 1, 1)) for i in range(count)}):

@@ -43,7 +43,7 @@ def place() -> Callable[[float, float], np.ndarray]:
     ends = boxes((19.9, 19.9, 0, 0.1, 0.1, 1, 0), (-19.9, -19.9, 0, 0.1, 0.1, 1, 0), label=1)
     picture = draw.birds_eye(None, ends, extent=EXTENT)
     found = pixels(picture, draw.colour_of(1))
-    inside = found[found[:, 1] < picture.shape[1] * 0.85]  # without the legend
+    inside = found[found[:, 1] < picture.shape[1] * 0.815]  # without the legend
     first, last = inside.min(0), inside.max(0)
     return lambda x, y: first + (last - first) * (np.array([20 - x, 20 - y]) / 40)
 

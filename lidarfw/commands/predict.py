@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     sources = predict.find_sources(args.scans, reader.lidar, args.calib, args.image)
     if model.plan.data.sweeps > 1:
         print(f"note: the model learned from {model.plan.data.sweeps} scans per frame, here each frame is one scan")
-    classes, folder = model.plan.data.classes, Path(args.output)
+    classes, extent, folder = model.plan.data.classes, predict.extent_of(model), Path(args.output)
     rows = []
     begin = time.perf_counter()
     for result in predict.predict(model, reader, _with_progress(sources), args.stream):
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         shown = predict.keep_scores(result, args.score)
         predict.save(shown, folder, args.format, classes)
         if not args.no_pictures:
-            predict.save_pictures(shown, folder, classes)
+            predict.save_pictures(shown, folder, classes, extent)
         rows.append(_row(shown, classes, seconds))
         begin = time.perf_counter()
     _print_table(rows, reader.left_out, folder)
