@@ -9,6 +9,7 @@ cell in their order in the scan: the same bits whatever the number of threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -26,14 +27,23 @@ class CellAssignment:
     """Which cell each point fell into, cells in canonical order."""
 
     index: Tensor  # (V, 4) int64 b, z, y, x, sorted, each cell once
-    inverse: Tensor  # (N,) int64 row of `index` for each point, -1 outside the grid
     counts: Tensor  # (V,) int64 points in each cell
     order: Tensor  # (M,) int64 points inside the grid, sorted by cell, in a cell by their number
+    points: int  # N, those outside the grid too
 
     @property
     def starts(self) -> Tensor:
         """(V + 1,) int64: the points of cell v are order[starts[v]:starts[v + 1]]."""
         return row_starts(self.counts)
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """(N,) int64 row of `index` for each point, -1 outside the grid."""
+        inverse = torch.full((self.points,), -1, device=self.order.device)
+        rows = torch.arange(len(self.counts), device=self.order.device)
+        return inverse.index_copy_(
+            0, self.order, torch.repeat_interleave(rows, self.counts, output_size=len(self.order))
+        )
 
 
 def row_starts(counts: Tensor) -> Tensor:
@@ -64,16 +74,13 @@ def cell_index(key: Tensor, shape: tuple[int, int, int]) -> Tensor:
 
 def _point_keys(xyz: Tensor, batch: Tensor, cells: int, grid: Grid, pillars: bool) -> Tensor:
     """Key of each point's cell, `cells` where it lies outside; the arithmetic of `Grid.index`, column by column."""
-    metric = xyz.t().contiguous()
-    cell = (metric - metric.new_tensor(grid.lower)[:, None]) / metric.new_tensor(grid.cell)[:, None]
-    cell = cell.floor_()
-    depth, height, width = grid.shape()
-    inside = (cell[0] >= 0) & (cell[0] < width)  # False for NaN
-    for row, size in ((1, height), (2, depth)):
-        inside &= (cell[row] >= 0) & (cell[row] < size)
-    x, y, z = torch.where(inside, cell, 0).to(key_type(cells)).unbind()
-    z, depth = (torch.zeros_like(z), 1) if pillars else (z, depth)
-    key = cell_key((batch.to(x.dtype), z, y, x), (depth, height, width))
+    key, inside = batch.to(key_type(cells)), torch.ones_like(batch, dtype=torch.bool)
+    for axis, size in zip((2, 1, 0), grid.shape(), strict=True):
+        cell = (xyz[:, axis] - xyz.new_tensor(grid.lower[axis])) / xyz.new_tensor(grid.cell[axis])
+        cell = cell.floor_()
+        inside &= (cell >= 0) & (cell < size)  # False for NaN
+        if not (pillars and axis == 2):
+            key = key * size + torch.where(inside, cell, 0).to(key.dtype)
     return torch.where(inside, key, cells)
 
 
@@ -92,11 +99,7 @@ def assign_cells(xyz: Tensor, batch: Tensor, batch_size: int, grid: Grid, pillar
     key, order = torch.sort(key, stable=True)
     inside = int((key < cells).sum())
     unique, counts = torch.unique_consecutive(key[:inside], return_counts=True)
-    order = order[:inside]
-    inverse = torch.full_like(batch, -1, dtype=torch.long)
-    rows = torch.arange(len(unique), device=key.device)
-    inverse[order] = torch.repeat_interleave(rows, counts, output_size=inside)
-    return CellAssignment(cell_index(unique, shape), inverse, counts, order)
+    return CellAssignment(cell_index(unique, shape), counts, order[:inside], len(xyz))
 
 
 class _SegmentSum(torch.autograd.Function):
@@ -162,10 +165,19 @@ def voxelize_mean(points: Points, grid: Grid) -> Voxels:
     Points outside the grid are dropped. Differentiable with respect to the points' features.
     """
     cells = assign_cells(points.xyz, points.batch, points.batch_size, grid)
-    features = torch.cat([points.xyz, points.features.to(points.xyz.dtype)], 1)
-    summed: Tensor = _SegmentSum.apply(features, cells.order, cells.starts, cells.inverse)  # type: ignore[no-untyped-call]
-    mean = summed / cells.counts[:, None].to(summed.dtype)
+    features = points.features.to(points.xyz.dtype)
+    starts = cells.starts
+    summed = [segment_sum(points.xyz, cells.order, starts), _sum_features(features, cells, starts)]
+    mean = torch.cat(summed, 1) / cells.counts[:, None].to(points.xyz.dtype)
     return Voxels(mean, cells.index, grid, grid.shape(), batch_size=points.batch_size)
+
+
+def _sum_features(features: Tensor, cells: CellAssignment, starts: Tensor) -> Tensor:
+    """(V, C) sums of features by cell, differentiable where the features are."""
+    if not features.requires_grad:
+        return segment_sum(features, cells.order, starts)
+    summed: Tensor = _SegmentSum.apply(features, cells.order, starts, cells.inverse)  # type: ignore[no-untyped-call]
+    return summed
 
 
 def group_points(cells: CellAssignment, maximum: int) -> tuple[Tensor, Tensor]:

@@ -104,9 +104,10 @@ class RangeView:
         Inside is False above `up`, at or below `down`, at the origin and where xyz is not finite; row and column
         are 0 there.
         """
-        distance = xyz.norm(dim=1)
-        elevation = torch.atan2(xyz[:, 2], xyz[:, :2].norm(dim=1))
-        azimuth = torch.atan2(xyz[:, 1], xyz[:, 0])
+        x, y, z = (axis.contiguous() for axis in xyz.unbind(1))  # several times as fast as strided columns
+        flat = x * x + y * y
+        distance = torch.sqrt(flat + z * z)
+        elevation, azimuth = torch.atan2(z, torch.sqrt(flat)), torch.atan2(y, x)
         row = torch.floor((self.up - elevation) / (self.up - self.down) * self.height)
         column = torch.floor((1 - azimuth / math.pi) * (self.width / 2)) % self.width
         inside = (row >= 0) & (row < self.height) & (distance > 0) & torch.isfinite(distance)
