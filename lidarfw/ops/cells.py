@@ -74,13 +74,13 @@ def cell_index(key: Tensor, shape: tuple[int, int, int]) -> Tensor:
 
 def _point_keys(xyz: Tensor, batch: Tensor, cells: int, grid: Grid, pillars: bool) -> Tensor:
     """Key of each point's cell, `cells` where it lies outside; the arithmetic of `Grid.index`, column by column."""
-    key, inside = batch.to(key_type(cells)), torch.ones_like(batch, dtype=torch.bool)
+    key, inside = batch.to(key_type(cells)), torch.ones(len(xyz), dtype=torch.bool, device=xyz.device)
     for axis, size in zip((2, 1, 0), grid.shape(), strict=True):
-        cell = (xyz[:, axis] - xyz.new_tensor(grid.lower[axis])) / xyz.new_tensor(grid.cell[axis])
-        cell = cell.floor_()
-        inside &= (cell >= 0) & (cell < size)  # False for NaN
+        cell = (xyz[:, axis] - xyz.new_tensor(grid.lower[axis])).div_(xyz.new_tensor(grid.cell[axis])).floor_()
+        clamped = cell.clamp(0, size - 1)
+        inside.logical_and_(clamped == cell)  # False for NaN
         if not (pillars and axis == 2):
-            key = key * size + torch.where(inside, cell, 0).to(key.dtype)
+            key = (key * size).add_(clamped.to(key.dtype))
     return torch.where(inside, key, cells)
 
 
