@@ -75,7 +75,7 @@ def spconv_voxelizer(grid: Grid, points: Tensor, maximum: int = 5) -> Callable[[
 def shapely_iou(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) exact BEV IoU."""
     shapely = importlib.import_module("shapely")
-    left, right = (shapely.polygons(box_corners(boxes)[:, :4, :2].double().numpy()) for boxes in (a, b))
+    left, right = (shapely.polygons(box_corners(boxes.double())[:, :4, :2].numpy()) for boxes in (a, b))
     common = shapely.area(shapely.intersection(left[:, None], right[None]))
     return torch.from_numpy(common / (shapely.area(left)[:, None] + shapely.area(right) - common))
 
@@ -142,7 +142,7 @@ def numba_functions() -> tuple[Callable[..., Any], Callable[..., Any]]:
         return ~dropped
 
     def corners(boxes: Tensor) -> Any:
-        return box_corners(boxes)[:, :4, :2].double().numpy()
+        return box_corners(boxes.double())[:, :4, :2].numpy()
 
     def run_matrix(a: Tensor, b: Tensor) -> Any:
         numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
