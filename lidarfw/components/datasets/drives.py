@@ -1,0 +1,211 @@
+"""What the datasets of recorded drives share: splits by sequence, poses, and past scans in the current frame."""
+
+from __future__ import annotations
+
+import functools
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from lidarfw import kitti
+from lidarfw._lazy import LazyModule
+from lidarfw.errors import ConfigError, DataError
+from lidarfw.interfaces.data import Dataset
+from lidarfw.io import read_points
+from lidarfw.types import FrameMeta, Points, Poses
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = LazyModule("torch")
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One sequence, a row per frame in order of time."""
+
+    name: str
+    scans: Sequence[Path]
+    times: Array  # (N,) seconds
+    poses: Array | None = None  # (N, 4, 4) LiDAR -> map; None where the dataset was not asked for poses
+
+
+class DriveDataset(Dataset):
+    """Frames of several sequences.
+
+    A split is a name of `splits`, the name of a sequence, `all` for every sequence that is there, or several of
+    these joined by `+`. Subclasses say which sequences there are (`present`) and read the lists of one (`open`);
+    nothing is read before the first frame is asked for.
+    """
+
+    splits: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    root: str
+    sweeps: int
+
+    @abstractmethod
+    def open(self, sequence: str) -> Drive:
+        """The frames of a sequence; DataError where its files are missing or broken."""
+
+    @abstractmethod
+    def present(self) -> list[str]:
+        """Names of all sequences whose scans are there."""
+
+    @property
+    def named(self) -> list[str]:
+        """The sequences that the split names; none for `all`, which depends on the disk."""
+        parts = self.split.split("+")
+        return list(dict.fromkeys(s for part in parts if part != "all" for s in self.splits.get(part, (part,))))
+
+    @functools.cached_property
+    def drives(self) -> list[Drive]:
+        """The sequences of the split, those without a frame left out."""
+        whole = self.present() if "all" in self.split.split("+") else []
+        drives = [self.open(name) for name in dict.fromkeys([*self.named, *whole])]
+        if not any(len(drive.scans) for drive in drives):
+            raise DataError(f"the split '{self.split}' of {self.root or 'no root'} has no frames: no scans there")
+        return [drive for drive in drives if len(drive.scans)]
+
+    @functools.cached_property
+    def _starts(self) -> npt.NDArray[np.int64]:
+        return np.cumsum([0, *(len(drive.scans) for drive in self.drives)])
+
+    def find(self, index: int) -> tuple[Drive, int]:
+        """The sequence of a frame, and its place there."""
+        index = range(len(self))[index]
+        number = int(np.searchsorted(self._starts, index, side="right")) - 1
+        return self.drives[number], index - int(self._starts[number])
+
+    def prepare(self) -> None:
+        """List the split, so that missing files show before training and not within."""
+        len(self)
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def meta(self, index: int) -> FrameMeta:
+        """Id, time and file of a frame, without its cameras."""
+        drive, place = self.find(index)
+        path = drive.scans[place]
+        name = f"{drive.name}/{path.name.split('.')[0]}"
+        return FrameMeta(name, drive.name, place, float(drive.times[place]), path=str(path))
+
+    def sequences(self) -> list[Sequence[int]]:
+        """The frames of each drive."""
+        return [range(start, end) for start, end in zip(self._starts[:-1].tolist(), self._starts[1:].tolist())]
+
+    def recent(self, place: int) -> list[int]:
+        """Places of the scans of a frame: its own first, then the past ones; fewer at the start of a sequence."""
+        return list(range(place, max(-1, place - self.sweeps), -1))
+
+    def points(self, drive: Drive, place: int) -> Points:
+        """The scan of a frame and, for `sweeps` > 1, the past ones moved into its frame, with times."""
+        scans = [self.scan(drive, past) for past in self.recent(place)]
+        if self.sweeps == 1:
+            return scans[0]
+        moved = [_moved(scan, drive, past, place) for scan, past in zip(scans, self.recent(place), strict=True)]
+        return Points.cat(moved)
+
+    def scan(self, drive: Drive, place: int) -> Points:
+        """One scan in its own frame: x, y, z and remission 0..1."""
+        return read_scan(drive.scans[place])
+
+
+def _moved(scan: Points, drive: Drive, past: int, now: int) -> Points:
+    if drive.poses is None:
+        raise ConfigError(f"{drive.name}: past scans need the poses of the sequence.\n  fix: sweeps=1, or give poses")
+    time = torch.full((len(scan),), float(drive.times[past] - drive.times[now]))
+    if past == now:
+        return scan.replace(time=time)
+    change = torch.tensor(inverse(drive.poses[now]) @ drive.poses[past])
+    xyz = scan.xyz.double() @ change[:3, :3].T + change[:3, 3]
+    return scan.replace(xyz=xyz.float(), time=time)
+
+
+def read_scan(path: Path) -> Points:
+    """A scan of float32 x, y, z, remission; DataError where remission is not 0..1."""
+    scan = read_points(path, columns=4)
+    low, high = float(scan.features.min()), float(scan.features.max())
+    if low < 0 or high > 1:
+        raise DataError(f"{path}: remission: expected 0..1, found {low:g}..{high:g}. Is it a scan of 4 columns?")
+    return Points.from_scan(torch.tensor(scan.xyz), torch.tensor(scan.features))
+
+
+def pose_of(drive: Drive, place: int) -> Poses | None:
+    """The pose of a frame as a batch of one; None where the drive has none."""
+    if drive.poses is None:
+        return None
+    matrix = torch.tensor(drive.poses[place], dtype=torch.float32)[None]
+    return Poses(matrix, torch.ones(1, dtype=torch.bool), torch.ones(1))
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    turn = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    result = np.array(matrix, dtype=np.float64)
+    result[..., :3, :3] = turn
+    result[..., :3, 3:] = -turn @ matrix[..., :3, 3:]
+    return result
+
+
+def read_table(path: Path, columns: int) -> Array:
+    """Numbers (N, columns) written as text, a row per line; DataError names the line that is wrong."""
+    rows = [line.split() for line in kitti.read_text(path).rstrip().splitlines()]
+    for number, row in enumerate(rows, 1):
+        if len(row) != columns:
+            raise DataError(
+                f"{path}, line {number}: expected {columns} numbers, found {len(row)}: {' '.join(row)[:80]}"
+            )
+    try:
+        table = np.array(rows, dtype=np.float64).reshape(-1, columns)
+    except ValueError as error:
+        raise DataError(f"{path}: expected {columns} numbers per line: {error}") from error
+    bad = ~np.isfinite(table).all(1)
+    if bad.any():
+        raise DataError(f"{path}, line {bad.argmax() + 1}: expected finite numbers, found {rows[bad.argmax()]}")
+    return table
+
+
+def read_poses(path: Path) -> Array:
+    """Poses (N, 4, 4) from lines of 12 numbers, rows of 3 x 4; DataError where one is no rigid transform."""
+    return rigid(read_table(path, 12), path)
+
+
+def rigid(rows: Array, path: Path) -> Array:
+    """Rigid transforms (N, 4, 4) of rows (N, 12) read from a file; DataError names the line of one that is not."""
+    matrices = np.tile(np.eye(4), (len(rows), 1, 1))
+    matrices[:, :3] = rows.reshape(-1, 3, 4)
+    turn = matrices[:, :3, :3]
+    wrong = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2
+    wrong |= np.linalg.det(turn) < 0
+    if wrong.any():
+        line = int(wrong.argmax())
+        raise DataError(f"{path}, line {line + 1}: expected a rotation (orthonormal), found {turn[line].tolist()}")
+    return matrices
+
+
+def rows_of(table: Array, numbers: Sequence[int], path: Path) -> Array:
+    """The rows of a file that belong to frames `numbers` (line = number + 1); DataError where it is too short."""
+    if numbers and max(numbers) >= len(table):
+        raise DataError(
+            f"{path}: has {len(table)} lines, but there is a scan {max(numbers):06d}: "
+            f"expected {max(numbers) + 1} lines or more"
+        )
+    return table[list(numbers)]
+
+
+def scans_in(folder: Path, suffix: str = ".bin") -> list[Path]:
+    """Files of a folder in order of their number; DataError where there is no such folder or a name is no number."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder.\n  fix: download or unpack the sequence, or correct root and split")
+    files = sorted(folder.glob(f"*{suffix}"))
+    for file in files:
+        if not file.stem.isdigit():
+            raise DataError(f"{file}: expected a number as the name, as in 000000{suffix}")
+    return files
