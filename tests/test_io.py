@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
@@ -283,18 +283,21 @@ def test_numpy_files_with_objects_or_wrong_shapes_are_refused(tmp_path: Path) ->
             read_points(tmp_path / name)
 
 
-def test_missing_folder_and_permission(tmp_path: Path) -> None:
+def test_missing_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         read_points(tmp_path / "none.bin")
     (tmp_path / "folder.bin").mkdir()
     with pytest.raises(DataError, match="is a folder"):
         read_points(tmp_path / "folder.bin")
-    path = save(tmp_path, "bin")
-    path.chmod(0)
-    if os.access(path, os.R_OK):
-        pytest.skip("this user may read everything")
-    with pytest.raises(DataError, match="cannot be read"):
-        read_points(path)
+
+
+def test_a_file_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path) -> bytes:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)  # a superuser may read what is forbidden to others
+    with pytest.raises(DataError, match=r"scan.bin: cannot be read: Permission denied"):
+        read_points(tmp_path / "scan.bin")
 
 
 def test_pictures(tmp_path: Path) -> None:
