@@ -43,6 +43,7 @@ SHAPES = {
     ),
 }
 CLUTTER = Shape((1, 1, 1), 0.0, (((0, 1), (0, 1), (0, 1)),), 0.2, (0.45, 0.5, 0.45))
+_HEADINGS, _SHARES = np.array([0.0, np.pi, np.pi / 2, -np.pi / 2]), (0.7, 0.2, 0.05, 0.05)  # most go our way
 _GROUND_REMISSION, _GROUND_COLOUR, _SKY_COLOUR = 0.1, (0.35, 0.35, 0.35), (0.6, 0.75, 0.95)
 
 
@@ -113,8 +114,8 @@ def _path(steps: int, rng: np.random.Generator) -> Array:
 def _draw_object(label: int, shape: Shape, rng: np.random.Generator) -> tuple[Array, Array]:
     x = rng.uniform(7, 45)
     y = rng.uniform(-1, 1) * min(0.8 * x, 20)
-    yaw = rng.integers(4) * np.pi / 2 + rng.normal(0, 0.15)
-    size = np.array(shape.size) * rng.normal(1, 0.03, 3)
+    yaw = rng.choice(_HEADINGS, p=_SHARES) + rng.normal(0, 0.1)
+    size = np.array(shape.size) * rng.normal(1, 0.02, 3)
     if label < 0:
         size = np.array([rng.uniform(0.2, 4), rng.uniform(0.2, 0.6), rng.uniform(0.5, 3)])
     moving = rng.random() < 0.5

@@ -35,7 +35,7 @@ else:
 SPLITS = ("train", "val", "test")
 _ROWS = 32  # beams of the scanner
 _FIELD = np.pi / 4  # radians to either side of straight ahead
-_FEWEST = 5  # returns that make an object worth learning
+_FEWEST = 10  # returns that make an object worth learning
 _CAMERA_HEIGHT = 0.1  # metres above the scanner
 CAMERA = Camera(
     "pinhole",
@@ -53,7 +53,7 @@ class SyntheticDataset(Dataset):
 
     Objects keep their size, track id and velocity through a sequence; the sensor moves too. The range is that of
     KITTI's camera view: x 0..70 m, y -40..40 m, ground at z = -1.73 m. A frame depends on (seed, split, index) alone.
-    Objects with fewer than five returns are ignored targets. Velocity is over ground, along the sensor's axes.
+    Objects with fewer than ten returns are ignored targets. Velocity is over ground, along the sensor's axes.
 
     frames: number of frames. sequence_length: frames per sequence, 0.1 s apart. points: rays per scan, of which
     about three quarters return. sweeps: scans per frame, the past ones moved into the current sensor frame.
