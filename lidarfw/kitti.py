@@ -31,6 +31,7 @@ else:
 Array = npt.NDArray[np.float64]
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc", "DontCare")
+TRACKING_TYPES = (*TYPES, "Person")  # tracking labels call a seated person so
 NEUTRAL = {"Van": "Car", "Person_sitting": "Pedestrian"}  # neither right nor wrong for the class
 IMAGE, RECTIFIED = "image", "rectified"  # cameras of a frame: the left colour picture, and the frame of the labels
 _COLUMNS = (
@@ -62,13 +63,27 @@ class Label:
         return " ".join([head, *(f"{number:.4f}" for number in numbers)]) + tail
 
 
+@dataclass(frozen=True)
+class TrackLabel:
+    """One line of a label or result file of KITTI tracking: an object and its identity in the sequence."""
+
+    frame: int
+    id: int  # the same number for the same object in every frame; -1 for DontCare
+    label: Label  # in tracking labels truncation is a level: 0 none, 1 partly, 2 largely
+
+    def line(self) -> str:
+        """The line of the file, without the line end."""
+        return f"{self.frame} {self.id} {self.label.line()}"
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The part of a calibration file that boxes and pictures of camera 2 need; matrices in float64."""
+    """The part of a calibration file that boxes, poses and pictures of camera 2 need; matrices in float64."""
 
     p2: Array  # (3, 4) rectified camera frame -> pixels of the left colour picture
     r0_rect: Array  # (3, 3) camera 0 -> rectified
     velo_to_cam: Array  # (3, 4) LiDAR -> camera 0
+    imu_to_velo: Array | None = None  # (3, 4) inertial unit -> LiDAR, where the file has it
 
     @property
     def to_rectified(self) -> Array:
@@ -168,16 +183,48 @@ def _check(label: Label, where: str) -> None:
 
 def read_calibration(path: str | Path) -> Calibration:
     """The calibration of a frame. DataError where a key is missing or its matrix cannot be what it should be."""
-    table = {key.strip(): values.split() for key, _, values in (r.partition(":") for r in read_text(path).splitlines())}
+    table = _keys(path)
     p2 = _matrix(table, "P2", (3, 4), path)
     zero = p2[[0, 1, 2, 2], [1, 0, 0, 1]]
     if not (p2[0, 0] > 0 and p2[1, 1] > 0 and np.allclose(zero, 0) and np.isclose(p2[2, 2], 1)):
         raise DataError(f"{path}: P2: expected fx 0 cx / 0 fy cy / 0 0 1 with fx, fy > 0, found {p2[:, :3].tolist()}")
     rectify, extrinsics = _matrix(table, "R0_rect", (3, 3), path), _matrix(table, "Tr_velo_to_cam", (3, 4), path)
-    for key, rotation in (("R0_rect", rectify), ("Tr_velo_to_cam", extrinsics[:, :3])):
+    inertial = _matrix(table, "Tr_imu_to_velo", (3, 4), path) if "Tr_imu_to_velo" in table else None
+    for key, matrix in (("R0_rect", rectify), ("Tr_velo_to_cam", extrinsics), ("Tr_imu_to_velo", inertial)):
+        rotation = np.eye(3) if matrix is None else matrix[:, :3]
         if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
             raise DataError(f"{path}: {key}: expected a rotation (orthonormal), found {rotation.tolist()}")
-    return Calibration(p2, rectify, extrinsics)
+    return Calibration(p2, rectify, extrinsics, inertial)
+
+
+_TRACKING_KEYS = {"R_rect": "R0_rect", "Tr_velo_cam": "Tr_velo_to_cam", "Tr_imu_velo": "Tr_imu_to_velo"}
+
+
+def _keys(path: str | Path) -> dict[str, list[str]]:
+    """Values by key, under the names of the object benchmark; the tracking benchmark has others, without a colon."""
+    rows = [line.split() for line in read_text(path).splitlines() if line.strip()]
+    named = [(row[0].removesuffix(":"), row[1:]) for row in rows]
+    return {_TRACKING_KEYS.get(key, key): values for key, values in named}
+
+
+_EARTH = 6378137.0  # metres, radius at the equator
+
+
+def poses_from_oxts(rows: Array) -> Array:
+    """Poses (N, 4, 4) of the inertial unit from OXTS rows (N, 30): latitude, longitude, altitude, roll, pitch, yaw ...
+
+    The map is east, north, up with its origin at the first row. Mercator projection at the scale of the first
+    latitude: the readme of the raw data development kit (Geiger et al., IJRR 2013).
+    """
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    latitude, longitude = np.radians(rows[:, 0]), np.radians(rows[:, 1])
+    scale = np.cos(latitude[:1]) * _EARTH
+    place = np.stack([scale * longitude, scale * np.log(np.tan(math.pi / 4 + latitude / 2)), rows[:, 2]], 1)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
+    poses[:, :3, 3] = place - place[:1]
+    return poses
 
 
 def _matrix(table: Mapping[str, list[str]], key: str, shape: tuple[int, int], path: str | Path) -> Array:
@@ -311,6 +358,31 @@ def labels_from_boxes(boxes: Boxes, classes: Sequence[str], cameras: Mapping[str
         Label(classes[label], -1, -1, alpha, tuple(rectangle), tuple(size), tuple(place), rotation, score)
         for label, alpha, rectangle, size, place, rotation, score in zip(*columns, strict=True)
     ]
+
+
+def read_tracks(path: str | Path, types: Sequence[str] = TRACKING_TYPES) -> list[TrackLabel]:
+    """The objects of a label (17 columns) or result file (18 columns) of KITTI tracking, one sequence, in file order.
+
+    DataError names file, line, column, expected and found value, as `read_labels` does.
+    """
+    rows = [(number, line.split()) for number, line in enumerate(read_text(path).splitlines(), 1) if line.strip()]
+    return [_parse_track(values, f"{path}, line {number}", types) for number, values in rows]
+
+
+def _parse_track(values: list[str], where: str, types: Sequence[str]) -> TrackLabel:
+    if len(values) not in (17, 18):
+        raise DataError(f"{where}: expected 17 columns (18 in results), found {len(values)}: {' '.join(values)[:80]}")
+    frame, track = (
+        _number(text, f"{where}: {name}") for text, name in zip(values, ("frame", "track id"), strict=False)
+    )
+    if frame < 0 or frame % 1 or track < -1 or track % 1:
+        raise DataError(f"{where}: frame, track id: expected whole numbers from 0 (id -1 for none), found {values[:2]}")
+    return TrackLabel(int(frame), int(track), _parse(values[2:], where, types))
+
+
+def write_tracks(path: str | Path, labels: Sequence[TrackLabel]) -> None:
+    """Write a label or result file of KITTI tracking, atomically; an empty file for a sequence without objects."""
+    write_text(path, "".join(label.line() + "\n" for label in labels))
 
 
 def write_results(path: str | Path, labels: Sequence[Label]) -> None:

@@ -232,7 +232,7 @@ def test_a_frame_without_objects_is_fine(kitti_root):
     ("old", "new", "words"),
     [
         ("P2:", "P9:", ["no key P2"]),
-        ("R0_rect:", "R_rect:", ["no key R0_rect"]),
+        ("R0_rect:", "R9_rect:", ["no key R0_rect"]),
         ("R0_rect: 1 0 0", "R0_rect: 1 0", ["R0_rect", "3 x 3", "8"]),
         ("R0_rect: 1 0 0", "R0_rect: 2 0 0", ["R0_rect", "rotation"]),
         ("R0_rect: 1 0 0", "R0_rect: nan 0 0", ["R0_rect", "finite"]),

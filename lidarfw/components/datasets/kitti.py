@@ -157,20 +157,13 @@ class KittiDataset(Dataset):
 
     def _picture_size(self, meta: FrameMeta) -> tuple[int, int]:
         """Width and height of the picture, from its header."""
-        from PIL import Image as Picture
-        from PIL import UnidentifiedImageError
-
-        if kitti.IMAGE not in meta.images:
-            width, height = PICTURE
-            warnings.warn(
-                f"{self.folder / 'image_2'} lacks pictures: the view is taken as {width} x {height}", stacklevel=2
-            )
-            return PICTURE
-        try:
-            with Picture.open(meta.images[kitti.IMAGE]) as picture:
-                return picture.size
-        except (OSError, UnidentifiedImageError) as error:
-            raise DataError(f"{meta.images[kitti.IMAGE]}: is not a readable picture: {error}") from error
+        if kitti.IMAGE in meta.images:
+            return picture_size(meta.images[kitti.IMAGE])
+        width, height = PICTURE
+        warnings.warn(
+            f"{self.folder / 'image_2'} lacks pictures: the view is taken as {width} x {height}", stacklevel=2
+        )
+        return PICTURE
 
     def _points(self, meta: FrameMeta) -> Points:
         scan = read_points(meta.path, columns=4)
@@ -209,3 +202,15 @@ class KittiDataset(Dataset):
         labels = kitti.read_labels(self.folder / "label_2" / f"{name}.txt", types)
         boxes, ignored = kitti.boxes_from_labels(labels, calibration, self.classes)
         return Targets(boxes=boxes, ignored=ignored)
+
+
+def picture_size(path: str) -> tuple[int, int]:
+    """Width and height of a picture, from its header; DataError where it is none."""
+    from PIL import Image as Picture
+    from PIL import UnidentifiedImageError
+
+    try:
+        with Picture.open(path) as picture:
+            return picture.size
+    except (OSError, UnidentifiedImageError) as error:
+        raise DataError(f"{path}: is not a readable picture: {error}") from error
