@@ -122,14 +122,14 @@ class KittiAP(Metric):
         level, level_found = level_boxes(objects, meta.cameras), level_boxes(found, meta.cameras)
         rectangles, rectangles_found = (
             _field(objects, "box2d", 4).round(3),
-            _rectangles(found, level_found, meta.cameras),
+            rectangles_of(found, level_found, meta.cameras),
         )
         overlaps = np.stack([_overlap_2d(rectangles_found, rectangles), *_overlaps_3d(level_found, level)])
         near = np.argwhere((overlaps > _LOOSEST).any(0))
-        detections = [_field(found, "label"), _field(found, "score"), _heights(rectangles_found)]
-        detections += [_share_covered(rectangles_found, regions), _alphas(found, level_found)]
+        detections = [_field(found, "label"), _field(found, "score"), heights(rectangles_found)]
+        detections += [share_covered(rectangles_found, regions), _alphas(found, level_found)]
         limits = [_field(objects, "occlusion"), _field(objects, "truncation").round(6), _alphas(objects, level)]
-        labels = [_field(objects, "label"), neutral, _heights(rectangles)]
+        labels = [_field(objects, "label"), neutral, heights(rectangles)]
         self._append(self.detections, np.stack(detections, 1))
         self._append(self.objects, np.stack([*labels, *limits], 1))
         self._append(self.pairs, np.concatenate([near, overlaps[:, near[:, 0], near[:, 1]].T], 1))
@@ -192,7 +192,8 @@ def _field(boxes: Boxes, name: str, width: int = 0) -> Array:
     return rows
 
 
-def _rectangles(boxes: Boxes, level: Array, cameras: Mapping[str, Camera]) -> Array:
+def rectangles_of(boxes: Boxes, level: Array, cameras: Mapping[str, Camera]) -> Array:
+    """2D boxes (M, 4) in pixels: those given, else round the projected boxes `level` (M, 7)."""
     return project_level_boxes(level, cameras) if boxes.box2d is None else _field(boxes, "box2d", 4)
 
 
@@ -200,7 +201,8 @@ def _alphas(boxes: Boxes, level: Array) -> Array:
     return observation_angles(level) if boxes.alpha is None else _field(boxes, "alpha")
 
 
-def _heights(rectangles: Array) -> Array:
+def heights(rectangles: Array) -> Array:
+    """(M,) heights of rectangles (M, 4), pixels."""
     return rectangles[:, 3] - rectangles[:, 1]
 
 
@@ -222,7 +224,7 @@ def _overlap_2d(a: Array, b: Array) -> Array:
     return common / np.maximum(_areas(a)[:, None] + _areas(b) - common, 1e-12)
 
 
-def _share_covered(a: Array, regions: Array) -> Array:
+def share_covered(a: Array, regions: Array) -> Array:
     """(N,) largest share of each rectangle that lies in one of the regions (M, 4)."""
     share: Array = (_common_area(a, regions) / np.maximum(_areas(a), 1e-12)[:, None]).max(1, initial=0)
     return share
