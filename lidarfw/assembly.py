@@ -240,6 +240,7 @@ class _Planner:
             if not nodes and slot in ("loss", "postprocessor", "metric"):
                 self._add_defaults(slot, heads)
         self._warn_unlearned(heads)
+        self._warn_unread()
 
     def _add_defaults(self, slot: str, heads: list[Step]) -> None:
         added: dict[str, Any] = {}
@@ -262,6 +263,12 @@ class _Planner:
         for head in heads:
             if head.id not in learned and any(step.slot == "loss" for step in self.steps):
                 self.warnings.append(f"{head.id} has no loss and will not learn")
+
+    def _warn_unread(self) -> None:
+        read = {ref.producer for step in self.steps for refs in step.takes.values() for ref in refs}
+        for step in self.steps:
+            if step.slot in ("backbone", "neck") and step.id not in read:
+                self.warnings.append(f"nothing reads the output of {step.id}")
 
     def _publish(self, step: Step) -> None:
         if step.slot in ("loss", "metric", "filter", "retriever"):

@@ -215,6 +215,13 @@ def test_options_of_a_component_that_is_not_selected_are_dropped_with_a_warning(
         plan(config, DATA)
 
 
+def test_a_neck_that_nothing_reads_is_pointed_out():
+    necks = {"widen": {}, "idle": {"type": "widen", "inputs": {"bev": "backbone.toy_pillars"}}}
+    heads = {"peak": {"inputs": {"bev": "neck.widen"}}}
+    planned = plan(nodes(backbone=["toy_pillars"], neck=necks, head=heads), DATA)
+    assert planned.warnings == ["nothing reads the output of neck.idle"]
+
+
 def test_parameters_carry_config_names():
     model = build(plan(nodes(backbone=["toy_pillars"], neck=["widen"], head=["peak"]), DATA))
     assert {"backbone.toy_pillars.scale", "neck.widen.conv.weight", "head.peak.conv.bias"} <= set(model.state_dict())
