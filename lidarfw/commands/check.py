@@ -1,10 +1,10 @@
-"""`lidarfw check`: the conformance kit without pytest."""
+"""`lidarfw check`: the conformance kit without pytest; `lidarfw check data`: every frame of a dataset."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,13 +12,20 @@ from lidarfw import registry
 from lidarfw.errors import ConfigError
 
 if TYPE_CHECKING:
+    from lidarfw.datacheck import Findings
+    from lidarfw.interfaces import Dataset
     from lidarfw.testing.checks import Case, CheckResult
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw check`."""
     parser.add_argument(
-        "target", nargs="?", help="distribution, or package.module:Class; default: the project in this folder"
+        "target",
+        nargs="?",
+        help="distribution, or package.module:Class; default: the project in this folder. `data` reads a dataset",
+    )
+    parser.add_argument(
+        "data", nargs="*", metavar="DATASET KEY=VALUE", help="after `data`: kitti root=/data/kitti split=val ..."
     )
     parser.add_argument("-k", "--only", metavar="WORD", default="", help="only checks with this in component or name")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line per check, the passed ones too")
@@ -26,6 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the checks, print a table, and give 1 where one failed."""
+    if args.target == "data":
+        return _check_data(args.data, args.verbose)
+    if args.data:
+        raise ConfigError(
+            f"one target at a time, found also {' '.join(args.data)}.\n  fix: lidarfw check {args.target}"
+        )
     from lidarfw.testing.checks import cases
 
     sys.path.insert(0, str(Path.cwd()))  # so that package.module:Class need not be installed
@@ -35,6 +48,53 @@ def run(args: argparse.Namespace) -> int:
     results = _run(chosen)
     _print(results, args.verbose)
     return 1 if any(result.status == "failed" for result in results) else 0
+
+
+def _check_data(words: list[str], verbose: bool) -> int:
+    """Read a split of a dataset, print each fault and a table, and give 1 where there is a fault."""
+    from lidarfw.datacheck import check_dataset
+
+    if not words or "=" in words[0]:
+        raise ConfigError("which dataset?\n  fix: lidarfw check data kitti root=/path/to/kitti split=train")
+    dataset = _dataset(words[0], words[1:])
+    found = check_dataset(dataset, _track)
+    for frame, reason in found.faults:
+        print(f"{frame}: {reason}")
+    _print_data(f"{words[0]}, split {dataset.split}", found, verbose)
+    return 1 if found.faults else 0
+
+
+def _dataset(name: str, overrides: list[str]) -> Dataset:
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    from lidarfw import declaration
+    from lidarfw.assembly import make_dataset
+
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        options = {override.key_or_group: override.value() for override in parsed}
+    except HydraException as error:
+        raise ConfigError(f"cannot read the options {' '.join(overrides)}: {error}") from error
+    split = options.pop("split", declaration.read("dataset", name).options["split"].default)
+    return make_dataset({"dataset": {name: {"type": name, **options}}}, str(split))
+
+
+def _track(frames: range) -> Iterator[int]:
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(frames, "frames", console=Console(stderr=True), transient=True)
+
+
+def _print_data(title: str, found: Findings, verbose: bool) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console, table = Console(soft_wrap=False), Table("of", "value", title=title, title_justify="left")
+    for what, value in found.summary(verbose).items():
+        table.add_row(what, value)
+    console.print(table)
 
 
 def _project_here() -> str:
