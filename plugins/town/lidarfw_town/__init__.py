@@ -1,0 +1,1 @@
+"""A simulated town: ray-cast LiDAR scans and pictures with exact ground truth."""

@@ -1,0 +1,176 @@
+"""Spinning LiDARs: where their beams point, and what comes back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from lidarfw_town.mesh import Mesh
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A spinning LiDAR.
+
+    Elevations from the highest beam to the lowest, degrees; columns per turn; noise of the range, metres; farthest
+    range, metres; `weakest`: signal (reflectance times cosine, relative to 30 m) at which half of the pulses are lost.
+    """
+
+    name: str
+    elevations: tuple[float, ...]
+    columns: int
+    noise: float
+    farthest: float
+    weakest: float
+    height: float = 1.73  # metres above the ground
+    turn: float = 0.1  # seconds
+
+    def rays(self) -> tuple[Floats, Floats]:
+        """Unit directions (beams, columns, 3) in the sensor frame, and the time of a column in turns, -0.5..0.5.
+
+        Columns run clockwise from behind, so that the beams look ahead in the middle of the turn.
+        """
+        elevation = np.radians(np.array(self.elevations))[:, None]
+        share = (np.arange(self.columns) + 0.5) / self.columns
+        azimuth = (np.pi * (1 - 2 * share))[None]
+        flat = np.cos(elevation)
+        parts = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) + 0 * azimuth)
+        return np.stack(parts, -1).astype(np.float32), (share - 0.5).astype(np.float32)
+
+
+def _even(up: float, down: float, count: int) -> tuple[float, ...]:
+    return tuple(float(angle) for angle in np.linspace(up, down, count))
+
+
+LIDARS = {
+    "hdl64": Lidar("hdl64", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 2048, 0.02, 120.0, 0.006),
+    "hdl32": Lidar("hdl32", _even(10.67, -30.67, 32), 2048, 0.02, 100.0, 0.008, 1.84),
+    "ouster32": Lidar("ouster32", _even(22.5, -22.5, 32), 1024, 0.015, 120.0, 0.008, 1.8),
+    "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 100.0, 0.006),
+}
+
+
+class Scene:
+    """Triangles made ready for rays."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._scene = EmbreeScene()
+        if len(mesh):
+            TriangleMesh(self._scene, mesh.triangles)
+
+    def cast(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32]]:
+        """Distance (N,), 1e37 for none, and triangle (N,), -1 for none, of the first hit; directions are of length 1."""
+        if not len(self.mesh):
+            return np.full(len(origins), 1e37, np.float32), np.full(len(origins), -1, np.int32)
+        found = self._scene.run(origins, directions, query="INTERSECT", output=1)
+        return found["tfar"], found["primID"]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays hit first, row by row: distance (1e37: nothing), class, instance, reflectance, colour, normal."""
+
+    distance: Floats
+    semantic: npt.NDArray[np.uint16]
+    instance: npt.NDArray[np.int32]
+    reflectance: Floats
+    colour: Floats
+    normal: Floats
+
+
+def first_hits(scenes: list[Scene], origins: Floats, directions: Floats) -> Hits:
+    """The nearest hits of rays (N, 3) in several scenes."""
+    distance, triangle = scenes[0].cast(origins, directions)
+    start, index = len(scenes[0].mesh), triangle.astype(np.int64)
+    for scene in scenes[1:]:
+        other, triangle = scene.cast(origins, directions)
+        nearer = (triangle >= 0) & (other < distance)
+        distance, index = np.where(nearer, other, distance), np.where(nearer, triangle + start, index)
+        start += len(scene.mesh)
+    return _look_up(scenes, distance, index)
+
+
+def _look_up(scenes: list[Scene], distance: Floats, index: npt.NDArray[np.int64]) -> Hits:
+    count = len(distance)
+    hits = Hits(
+        distance, np.zeros(count, np.uint16), np.zeros(count, np.int32), np.zeros(count, np.float32),
+        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32),
+    )  # fmt: skip
+    start = 0
+    for scene in scenes:
+        rows = np.flatnonzero((index >= start) & (index < start + len(scene.mesh)))
+        triangles = index[rows] - start
+        for name in ("semantic", "instance", "reflectance", "colour"):
+            getattr(hits, name)[rows] = getattr(scene.mesh, name)[triangles]
+        hits.normal[rows] = scene.mesh.normals[triangles]
+        start += len(scene.mesh)
+    return hits
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A turn of a LiDAR: range (R, C) in metres (0: nothing came back), remission (R, C) 0..1, class, instance."""
+
+    range: Floats
+    remission: Floats
+    semantic: npt.NDArray[np.uint16]
+    instance: npt.NDArray[np.int32]
+
+
+def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generator, weather: float = 0.0) -> Scan:
+    """What the LiDAR measures of the hits of its rays, beam by beam.
+
+    The signal falls with the square of the range and the cosine of incidence; weak pulses are lost, and the rest is
+    given with noise. At edges a beam meets two surfaces and may measure a place between them; such points have the
+    class 1 (outlier) and belong to no object. `weather` is the extinction of rain or fog, per metre.
+    """
+    shape = (len(lidar.elevations), lidar.columns)
+    cosine = np.abs((hits.normal * directions).sum(1))
+    reach = np.minimum(hits.distance, 1e3)
+    signal = (
+        hits.reflectance * np.maximum(cosine, 0.01) * np.exp(-2 * weather * reach) / np.maximum(reach / 30, 0.15) ** 2
+    )
+    lost = rng.random(len(signal)) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
+    glassy = (hits.reflectance < 0.08) & (rng.random(len(signal)) < 0.55)
+    gone = lost | glassy | (hits.distance > lidar.farthest) | _own_roof(directions)
+    distance = hits.distance + rng.normal(0, lidar.noise, len(signal)).astype(np.float32)
+    distance = np.where(gone, 0, distance).reshape(shape).astype(np.float32)
+    mixed = _mix(distance, rng)
+    semantic = np.where(mixed, 1, hits.semantic.reshape(shape)).astype(np.uint16)
+    return Scan(
+        distance,
+        _remission(hits, cosine, signal, rng).reshape(shape),
+        semantic,
+        np.where(mixed, 0, hits.instance.reshape(shape)),
+    )
+
+
+def _remission(hits: Hits, cosine: Floats, signal: Floats, rng: np.random.Generator) -> Floats:
+    """Calibrated remission: mostly the reflectance, weaker at grazing incidence, 0 where the pulse was faint."""
+    value = hits.reflectance * (0.62 + 0.48 * cosine) * rng.normal(1, 0.13, len(cosine))
+    faint = rng.random(len(cosine)) < 1 / (1 + (signal / 0.02) ** 1.5)
+    # levels of a hundredth, as the devices give them
+    return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)
+
+
+def _mix(distance: Floats, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+    """Move some points at edges to between their surface and the one behind; which ones."""
+    behind = np.maximum(np.roll(distance, 1, 1), np.roll(distance, -1, 1))
+    jump = behind - distance
+    mixed = (distance > 0) & (jump > 0.4) & (jump < 6) & (rng.random(distance.shape) < 0.08)
+    distance[mixed] += (jump * rng.uniform(0.15, 0.85, jump.shape))[mixed]
+    return np.asarray(mixed)
+
+
+def _own_roof(directions: Floats) -> npt.NDArray[np.bool_]:
+    """Rays that the roof of the own vehicle stops, 0.45 m below the sensor and 0.65 m to each side."""
+    down = np.minimum(directions[:, 2], -1e-6)
+    ahead, aside = -0.45 * directions[:, 0] / down, -0.45 * directions[:, 1] / down
+    return np.asarray((ahead < 0.6) & (ahead > -1.3) & (np.abs(aside) < 0.65))
