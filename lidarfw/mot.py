@@ -191,13 +191,14 @@ def recall_thresholds(scores: Array, objects: int) -> list[tuple[float, float]]:
     Down the sorted scores, the one whose recall comes nearest to each point; the lowest is always taken.
     """
     falling = -np.sort(-scores)
-    points: list[float] = []
+    points: list[tuple[float, float]] = []
+    wanted = 0.0  # added up as the devkit does: rounding decides between two scores that are equally near
     for rank, score in enumerate(falling.tolist(), 1):
-        wanted = len(points) / RECALLS
         further = (rank + 1) / objects - wanted < wanted - rank / objects
         if rank == len(falling) or not further:
-            points.append(score)
-    return [(score, number / RECALLS) for number, score in enumerate(points)][1:]  # the first stands for recall 0
+            points.append((score, wanted))
+            wanted += 1 / RECALLS
+    return points[1:]  # the first stands for recall 0
 
 
 def idf1(scene: Scene, iou: float) -> dict[str, float]:
