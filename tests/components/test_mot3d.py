@@ -95,7 +95,7 @@ def test_recall_thresholds() -> None:
     assert [recall for _, recall in points] == pytest.approx([0.025, 0.05, 0.075, 0.1, 0.125, 0.15, 0.175])
     dense = recall_thresholds(np.linspace(1, 0, 400), 400)
     assert len(dense) == 40
-    assert dense[-1][1] == 1
+    assert dense[-1][1] == pytest.approx(1)
     assert recall_thresholds(np.zeros(0), 5) == []
 
 
