@@ -6,6 +6,7 @@ one of (seed, epoch, frame), so a resumed run and a run with other workers read 
 
 from __future__ import annotations
 
+import itertools
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -292,12 +293,11 @@ def clips_of(dataset: Dataset, length: int) -> list[Sequence[int]]:
 
 
 class DataModule(pl.LightningDataModule):
-    """The one data module: training in shuffled clips, evaluation in whole sequences, each on one rank.
+    """The one data module: training in shuffled clips, evaluation in order of time.
 
-    `datasets` and `transforms` are by stage: train, val, test; a stage may be missing.
+    `datasets` and `transforms` are by stage: train, val, test; a stage may be missing. With `streams`, evaluation
+    keeps every sequence on one rank, for filters and trackers; else the ranks get equal runs of frames.
     """
-
-    allow_zero_length_dataloader_with_multiple_devices = True  # fewer sequences than ranks
 
     def __init__(
         self,
@@ -310,6 +310,7 @@ class DataModule(pl.LightningDataModule):
         clip: int = 1,
         timeout: float = 120,
         bad_sample: str = "error",
+        streams: bool = True,
     ) -> None:
         super().__init__()
         self.datasets = dict(datasets)
@@ -322,18 +323,20 @@ class DataModule(pl.LightningDataModule):
         if bad_sample not in BAD_SAMPLE_POLICIES:
             raise ConfigError(f"loader.bad_sample is {bad_sample!r}; use one of: {', '.join(BAD_SAMPLE_POLICIES)}")
         self.skip = bad_sample == "skip"
+        self.streams = streams
+        self.idle = False  # whether this rank has nothing to evaluate, and reads a frame only to keep step
         self._train_loader: FrameLoader | None = None
         self._resume: dict[str, int] | None = None
 
     @classmethod
-    def from_config(cls, config: DictConfig) -> DataModule:
+    def from_config(cls, config: DictConfig, streams: bool = True) -> DataModule:
         """Datasets of `config.splits`, with the transforms of the config."""
         from lidarfw.assembly import make_dataset, make_transforms
 
         stages = [stage for stage in STAGES if config.splits.get(stage)]
         datasets = {stage: make_dataset(config, config.splits[stage]) for stage in stages}
         transforms = {stage: make_transforms(config, training=stage == "train") for stage in stages}
-        return cls(datasets, transforms, seed=config.seed, **config.loader)
+        return cls(datasets, transforms, seed=config.seed, streams=streams, **config.loader)
 
     def prepare_data(self) -> None:
         """Let datasets and transforms get their files ready; Lightning calls this on one process per node."""
@@ -381,16 +384,23 @@ class DataModule(pl.LightningDataModule):
         self._resume = state_dict.get("train")
 
     def val_dataloader(self) -> FrameLoader:
-        """The val split in whole sequences."""
+        """The val split in order."""
         return self._evaluation("val")
 
     def test_dataloader(self) -> FrameLoader:
-        """The test split in whole sequences."""
+        """The test split in order."""
         return self._evaluation("test")
 
     def _evaluation(self, stage: str) -> FrameLoader:
         dataset = self._dataset(stage)
-        frames = [(index,) for sequence in dataset.sequences()[self.rank :: self.world] for index in sequence]
+        runs = dataset.sequences()
+        if not self.streams:
+            whole = [index for run in runs for index in run]
+            bounds = [len(whole) * rank // self.world for rank in range(self.world + 1)]
+            runs = [whole[start:end] for start, end in itertools.pairwise(bounds)]
+        frames = [(index,) for run in runs[self.rank :: self.world] for index in run]
+        self.idle = not frames
+        frames = frames or [(0,)]
         order = BatchOrder(len(frames), self.batch_size, seed=self.seed, shuffle=False)
         return self._loader(Clips(dataset, self.transforms[stage], frames, self.seed, replace=False), order)
 

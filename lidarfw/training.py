@@ -163,7 +163,14 @@ class PerceptionModule(pl.LightningModule):
         """Count the finished frames of a batch into the metrics."""
         self._seed(batch_idx)
         self.sample_ids = [meta.id for meta in batch.meta]
-        self.model.update_metrics(self._finished(self.model.decode(self.model(batch), batch)))
+        results = self._finished(self.model.decode(self.model(batch), batch))
+        if not self._idle:
+            self.model.update_metrics(results)
+
+    @property
+    def _idle(self) -> bool:
+        """Whether this process evaluates a frame only to keep step with the others."""
+        return bool(getattr(getattr(self.trainer, "datamodule", None), "idle", False))
 
     def _finished(self, results: list[FrameResult]) -> list[FrameResult]:
         """The frames that filters and tracker let out; a stream sees whole sequences in order."""
@@ -173,6 +180,8 @@ class PerceptionModule(pl.LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         """Start counting."""
+        for metric in self.model.metrics.values():
+            metric.to(self.device)
         self.model.reset_metrics()
         self._stream = self.model.stream() if self.model.filters else None
 
@@ -181,7 +190,7 @@ class PerceptionModule(pl.LightningModule):
         self._log_metrics("val")
 
     def _log_metrics(self, stage: str) -> None:
-        if self._stream is not None:
+        if self._stream is not None and not self._idle:
             self.model.update_metrics(self._stream.flush())
         figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
         for name, value in figures.items():
@@ -308,7 +317,7 @@ def train(config: DictConfig) -> dict[str, float]:
         model = build(wired)
         _initialise(model, config.init)
         module = _module(model, to_plain(config), checkpoint.describe(wired))
-        data = DataModule.from_config(config)
+        data = DataModule.from_config(config, streams=bool(model.filters))
         trainer = make_trainer(config, folder, [stop], validate="val" in data.datasets)
         if trainer.is_global_zero:
             write_text(folder / "config.yaml", yaml.safe_dump(wired.config, sort_keys=False, allow_unicode=True))
@@ -446,7 +455,8 @@ def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float
     module = _module(model, to_plain(config), about)
     with Termination() as stop:
         trainer = make_trainer(config, Path(path).parent, [stop])
-        trainer.test(module, datamodule=DataModule.from_config(config), verbose=False)
+        data = DataModule.from_config(config, streams=bool(model.filters))
+        trainer.test(module, datamodule=data, verbose=False)
     return {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()}
 
 

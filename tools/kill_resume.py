@@ -97,7 +97,7 @@ def main() -> int:
     print(f"uninterrupted run: {seconds:.1f} s")
     kills = 0
     while kills < args.kills:
-        if not kill_once(killed, overrides, spread=seconds / args.kills):
+        if not kill_once(killed, overrides, spread=seconds / args.kills / 2):
             break
         kills += 1
         step = torch.load(killed / "checkpoints" / "last.ckpt", weights_only=True)["global_step"]

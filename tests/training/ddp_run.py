@@ -5,6 +5,7 @@ With LIDARFW_TEST_FAIL_AT=n, process 1 fails at its n-th step.
 
 import os
 import sys
+from pathlib import Path
 
 import training_parts
 from omegaconf import OmegaConf
@@ -19,6 +20,7 @@ step = PerceptionModule.training_step
 
 def training_step(self, batch, batch_idx):
     if self.global_rank == 1 and self.global_step == fail_at:
+        Path(sys.argv[1], "failed").touch()
         raise RuntimeError("process 1 fails")
     return step(self, batch, batch_idx)
 

@@ -142,6 +142,17 @@ def test_evaluation_gives_whole_sequences_in_order_to_one_rank(monkeypatch):
     assert seen[1] == [f"val{i:03d}" for i in (4, 5, 6, 7)]
 
 
+def test_evaluation_without_streams_gives_equal_runs_of_frames(monkeypatch):
+    seen = []
+    for rank in range(3):
+        monkeypatch.setattr(DataModule, "rank", rank)
+        monkeypatch.setattr(DataModule, "world", 3)
+        frames = loader(stage="val", dataset=ToyDataset(split="val", frames=10, length=10), streams=False)
+        seen.append(flat(ids(frames)))
+    assert [len(part) for part in seen] == [3, 3, 4]
+    assert flat(seen) == [f"val{i:03d}" for i in range(10)]
+
+
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_broken_frame_is_named(workers):
     with pytest.raises(DataError) as error:

@@ -33,6 +33,13 @@ def test_two_processes_see_every_frame_once_and_agree(tmp_path):
     assert alone["toy/accuracy"] == pytest.approx(figures["val/toy/accuracy"])
 
 
+@pytest.mark.parametrize(("frames", "overrides"), [(4, ["filter=delay"]), (1, []), (4, [])])
+def test_a_process_may_have_nothing_to_evaluate(frames, overrides, tmp_path):
+    """One sequence on one process for a model with a filter; fewer frames than processes."""
+    figures = train(settings(tmp_path, *FORKED, f"dataset.toy.frames={frames}", "trainer.max_epochs=2", *overrides))
+    assert figures["val/toy/frames"] == frames
+
+
 def test_two_processes_resume_bit_for_bit(tmp_path, monkeypatch):
     save = callbacks.Checkpoints.save_last
 
@@ -49,8 +56,7 @@ def test_two_processes_resume_bit_for_bit(tmp_path, monkeypatch):
 
 
 def test_a_process_that_fails_ends_the_run(tmp_path):
-    started = time.monotonic()
     done = start(tmp_path, LIDARFW_TEST_FAIL_AT="3")
     assert done.returncode != 0
     assert "process 1 fails" in done.stderr
-    assert time.monotonic() - started < 60
+    assert time.time() - (tmp_path / "failed").stat().st_mtime < 60
