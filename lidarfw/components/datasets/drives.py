@@ -93,7 +93,7 @@ class DriveDataset(Dataset):
         """Id, time and file of a frame, without its cameras."""
         drive, place = self.find(index)
         path = drive.scans[place]
-        name = f"{drive.name}/{path.name.split('.')[0]}"
+        name = f"{drive.name}/{path.stem}"
         return FrameMeta(name, drive.name, place, float(drive.times[place]), path=str(path))
 
     def sequences(self) -> list[Sequence[int]]:
@@ -106,7 +106,14 @@ class DriveDataset(Dataset):
 
     def points(self, drive: Drive, place: int) -> Points:
         """The scan of a frame and, for `sweeps` > 1, the past ones moved into its frame, with times."""
-        scans = [self.scan(drive, past) for past in self.recent(place)]
+        return self.merged(self.scans(drive, place), drive, place)
+
+    def scans(self, drive: Drive, place: int) -> list[Points]:
+        """The scans of a frame, each in its own frame."""
+        return [self.scan(drive, past) for past in self.recent(place)]
+
+    def merged(self, scans: Sequence[Points], drive: Drive, place: int) -> Points:
+        """The scans of a frame as one, in the frame of the first."""
         if self.sweeps == 1:
             return scans[0]
         moved = [_moved(scan, drive, past, place) for scan, past in zip(scans, self.recent(place), strict=True)]
@@ -198,6 +205,17 @@ def rows_of(table: Array, numbers: Sequence[int], path: Path) -> Array:
             f"expected {max(numbers) + 1} lines or more"
         )
     return table[list(numbers)]
+
+
+def read_ids(path: Path, count: int) -> npt.NDArray[np.uint32]:
+    """A uint32 for each of `count` points; DataError where the file is missing or of another length."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}. Are the labels there?") from error
+    if len(data) != 4 * count:
+        raise DataError(f"{path}: expected {4 * count} bytes (uint32 for each of {count} points), found {len(data)}")
+    return np.frombuffer(data, "<u4")
 
 
 def scans_in(folder: Path, suffix: str = ".bin") -> list[Path]:

@@ -20,6 +20,7 @@ from lidarfw.components.datasets.drives import (
     DriveDataset,
     inverse,
     pose_of,
+    read_ids,
     read_poses,
     read_table,
     rigid,
@@ -148,19 +149,19 @@ class SemanticKittiDataset(DriveDataset):
 
     def __getitem__(self, index: int) -> Frame:
         drive, place = self.find(index)
-        points, pose = self.points(drive, place), pose_of(drive, place)
+        scans, pose = self.scans(drive, place), pose_of(drive, place)
+        points = self.merged(scans, drive, place)
         inputs: dict[str, Points | Poses | None] = {"points": points} | ({"pose": pose} if self.pose else {})
-        labels = self._labels(drive, place, len(points)) if self.labelled else None
+        labels = self._labels(drive, place, scans) if self.labelled else None
         return Frame(inputs, Targets(points=labels, poses=pose), self.meta(index))
 
-    def _labels(self, drive: Drive, place: int, count: int) -> PointLabels:
+    def _labels(self, drive: Drive, place: int, scans: list[Points]) -> PointLabels:
         """Class and instance of every point of the frame's scans."""
         paths = [self._label_path(drive.scans[past]) for past in self.recent(place)]
-        sizes = [drive.scans[past].stat().st_size // 16 for past in self.recent(place)]
-        found = [_read_labels(path, size, self.task) for path, size in zip(paths, sizes, strict=True)]
+        found = [_read_labels(path, len(scan), self.task) for path, scan in zip(paths, scans, strict=True)]
         label, instance = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*found, strict=True))
         probability = (label[:, None] == torch.arange(len(self.spec.classes))).float()
-        return PointLabels(probability, torch.zeros(count, dtype=torch.long), 1, instance)
+        return PointLabels(probability, torch.zeros(len(label), dtype=torch.long), 1, instance)
 
     @staticmethod
     def _label_path(scan: Path) -> Path:
@@ -186,13 +187,7 @@ def _extrinsics(path: Path) -> Array:
 
 def _read_labels(path: Path, count: int, task: str) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Class (N,), -1 unlabelled, and instance (N,), 0 none, from uint32: class below, instance above 16 bits."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}. Download the labels.") from error
-    if len(data) != 4 * count:
-        raise DataError(f"{path}: expected {4 * count} bytes (uint32 for each of {count} points), found {len(data)}")
-    raw = np.frombuffer(data, "<u4")
+    raw = read_ids(path, count)
     label = _table(task)[raw & 0xFFFF]
     if (label == _UNKNOWN).any():
         unknown = np.unique(raw[label == _UNKNOWN] & 0xFFFF)
