@@ -62,14 +62,20 @@ def cell_key(columns: tuple[Tensor, Tensor, Tensor, Tensor], shape: tuple[int, i
     return ((b * shape[0] + z) * shape[1] + y) * shape[2] + x
 
 
-def cell_index(key: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Inverse of `cell_key`: (N, 4) int64 b, z, y, x."""
+def cell_columns(key: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Inverse of `cell_key`: b, z, y, x (N,), in the type of the key."""
     columns = []
     for size in reversed(shape):
         quotient = torch.div(key, size, rounding_mode="floor")
-        columns.append(key - quotient * size)
+        columns.append(torch.sub(key, quotient, alpha=size))
         key = quotient
-    return torch.stack([key, *reversed(columns)], 1).long()
+    x, y, z = columns
+    return key, z, y, x
+
+
+def cell_index(columns: tuple[Tensor, ...]) -> Tensor:
+    """(N, 4) int64 b, z, y, x of four vectors (N,)."""
+    return torch.stack(columns, 1).long()
 
 
 def _point_keys(xyz: Tensor, batch: Tensor, cells: int, grid: Grid, pillars: bool) -> Tensor:
@@ -99,7 +105,7 @@ def assign_cells(xyz: Tensor, batch: Tensor, batch_size: int, grid: Grid, pillar
     key, order = torch.sort(key, stable=True)
     inside = int((key < cells).sum())
     unique, counts = torch.unique_consecutive(key[:inside], return_counts=True)
-    return CellAssignment(cell_index(unique, shape), counts, order[:inside], len(xyz))
+    return CellAssignment(cell_index(cell_columns(unique, shape)), counts, order[:inside], len(xyz))
 
 
 class _SegmentSum(torch.autograd.Function):

@@ -10,14 +10,14 @@ never wraps to another line; the order of the keys is the canonical order.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from lidarfw.ops.cells import cell_index, cell_key, key_type, row_starts
+from lidarfw.ops.cells import cell_columns, cell_index, cell_key, key_type, row_starts
 from lidarfw.ops.scratch import scratch, zeroed
 from lidarfw.types import Voxels
 
@@ -100,6 +100,8 @@ class Rulebook:
 
     def blocks(self) -> list[Block]:
         """The blocks, made at first use: each of at most about `_BLOCK_PAIRS` pairs, covering all output rows."""
+        if self._blocks is None and self.symmetric and self._transposed is not None and self._transposed._blocks:
+            self._blocks = [self._mirrored(block) for block in self._transposed._blocks]
         if self._blocks is None:
             starts = row_starts(self.pairs_per_output())
             number = len(self) // _BLOCK_PAIRS + 1
@@ -112,12 +114,19 @@ class Rulebook:
             ]
         return self._blocks
 
+    def _mirrored(self, block: Block) -> Block:
+        groups = [(inputs, outputs, self.volume - 1 - element) for inputs, outputs, element in block.groups]
+        return replace(block, groups=groups)
+
     def _bounds(self, first_rows: Tensor) -> Tensor:
         """(blocks + 1, groups) int64 pair at which each group's part of each block begins, and the groups' ends."""
         sizes = torch.tensor(self.counts, dtype=torch.long, device=first_rows.device)
         inside = sizes.repeat(len(first_rows) + 1, 1)
-        for column, group in enumerate(self.outputs.split_with_sizes(self.counts)):
-            inside[:-1, column] = torch.searchsorted(group, first_rows.int())
+        if len(first_rows) == 1:
+            inside[0] = 0
+        else:
+            for column, group in enumerate(self.outputs.split_with_sizes(self.counts)):
+                inside[:-1, column] = torch.searchsorted(group, first_rows.int())
         return inside + (sizes.cumsum(0) - sizes)
 
     def _block(self, rows: slice, begin: list[int], end: list[int], starts: Tensor) -> Block:
@@ -125,6 +134,8 @@ class Rulebook:
         groups = [(self.inputs[run], self.outputs[run], element) for run, element in runs]
         outputs = torch.cat([g[1] for g in groups] or [self.outputs[:0]])
         own = starts[rows.start : rows.stop + 1]
+        narrow = rows.stop - rows.start < 2**15  # fewer digits for the radix sort
+        outputs = (outputs - rows.start).short() if narrow else outputs
         order = torch.sort(outputs, stable=True)[1].int()
         return Block(rows, groups, len(outputs), order, (own - own[0]).int())
 
@@ -189,13 +200,10 @@ def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tens
         return none, none, (0,) * len(shifts)
     wanted = (keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]).view(-1)
     neighbour = _look_up(keys, wanted, cells)
-    hit = neighbour >= 0
-    counts = tuple(hit.view(len(shifts), -1).sum(1).tolist())
-    found = hit.nonzero().squeeze(1)
-    neighbour = neighbour.index_select(0, found)
-    for number, group in enumerate(found.split_with_sizes(counts)):
-        group -= number * len(keys)
-    return found.int(), neighbour, counts
+    neighbour = neighbour.view(len(shifts), -1)
+    rows = [hit.nonzero().squeeze(1) for hit in neighbour >= 0]
+    found = [line.index_select(0, row) for line, row in zip(neighbour, rows, strict=True)]
+    return torch.cat(rows).int(), torch.cat(found), tuple(map(len, rows))
 
 
 def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
@@ -285,7 +293,9 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     inputs = (flat % max(len(b), 1)).int()
     elements = tuple(range(kernel.volume))
     book = Rulebook(inputs, outputs, elements, counts, len(b), len(unique), kernel.volume)
-    return StridedRulebook(book, cell_index(unique, shape), shape)
+    columns = cell_columns(unique, shape)
+    index = cell_index(columns)
+    return StridedRulebook(book, index, shape, {"sites": _Sites(index, columns)})
 
 
 def _element_type(kernel: Kernel) -> torch.dtype:
