@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lidarfw.components.metrics.kitti_ap import heights, rectangles_of, share_covered
+from lidarfw.components.metrics.sequence import sequence_number
 from lidarfw.components.per_class import per_class
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Metric
@@ -170,9 +170,8 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _place(meta: FrameMeta, count: int) -> tuple[Array, Array]:
-    """Number of the sequence, the same in every process and exact in float64, and place of the frame."""
-    digest = hashlib.blake2b(meta.sequence.encode(), digest_size=6).digest()
-    return np.full(count, float(int.from_bytes(digest, "big"))), np.full(count, float(meta.index))
+    """Number of the sequence, and place of the frame."""
+    return np.full(count, sequence_number(meta.sequence)), np.full(count, float(meta.index))
 
 
 def _overlaps(truth: Boxes, boxes: Boxes, meta: FrameMeta) -> Array:
