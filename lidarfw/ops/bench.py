@@ -87,12 +87,15 @@ def _street(random: torch.Generator) -> tuple[Tensor, Tensor]:
         base = torch.cat([center[:, :2] - half[:, :2], torch.full((count, 1), -_SENSOR_HEIGHT)], 1)
         return torch.cat([base, base + 2 * half], 1)
 
-    facades = [row(14, [-70, side * 14.0, 0], [90, side * 20.0, 0], [9, 6, 5], [8, 3, 7]) for side in (-1, 1)]
-    cars = [row(12, [-60, side * 4.5, 0], [80, side * 6.0, 0], [3.8, 1.6, 1.4], [1, 0.3, 0.5]) for side in (-1, 1)]
+    sides = (-1, 1)
+    facades = [row(12, [-70, side * 16.0, 0], [90, side * 24.0, 0], [9, 6, 5], [8, 3, 7]) for side in sides]
+    cars = [row(12, [-60, side * 4.5, 0], [80, side * 6.0, 0], [3.8, 1.6, 1.4], [1, 0.3, 0.5]) for side in sides]
     poles = row(20, [-60, -9, 0], [80, 9, 0], [0.15, 0.15, 4], [0.2, 0.2, 3])
-    bushes = [row(14, [-60, side * 9.0, 0], [80, side * 13.0, 0], [1, 1, 0.8], [3, 2, 3]) for side in (-1, 1)]
-    solid, soft = torch.cat([*facades, *cars, poles]), torch.cat(bushes)
-    return torch.cat([solid, soft]), torch.cat([torch.zeros(len(solid)), torch.full((len(soft),), 1.5)])
+    bushes = [row(20, [-60, side * 8.0, 0], [80, side * 13.0, 0], [1.5, 1.5, 0.8], [4, 3, 2]) for side in sides]
+    crowns = [row(12, [-60, side * 7.0, 0], [80, side * 12.0, 0], [3, 3, 4], [4, 3, 4]) for side in sides]
+    crowns = [c + torch.tensor([0, 0, 2.5, 0, 0, 0]) for c in crowns]
+    solid, soft = torch.cat([*facades, *cars, poles]), torch.cat([*bushes, *crowns])
+    return torch.cat([solid, soft]), torch.cat([torch.zeros(len(solid)), torch.full((len(soft),), 2.5)])
 
 
 def _scan(boxes: Tensor, depth: Tensor, origin: Tensor, half_view: float, random: torch.Generator) -> Tensor:
@@ -111,6 +114,8 @@ def _scan(boxes: Tensor, depth: Tensor, origin: Tensor, half_view: float, random
         hit = (near > 0) & (near < far) & (inside < far)
         distance = torch.where(hit, torch.minimum(distance, inside), distance)
     distance = distance + torch.randn(len(distance), generator=random) * 0.015
+    rough = (origin + direction * distance[:, None])[:, 1].abs() > 5.5  # grass beside the road
+    distance = distance - rough * torch.rand(len(distance), generator=random) * 0.04 * distance.clamp(max=25)
     seen = (distance < 100) & (torch.rand(len(distance), generator=random) > 0.08)
     return direction[seen] * distance[seen, None] + origin
 
