@@ -68,7 +68,7 @@ def test_a_figure_that_should_be_small(run, tmp_path):
         "callbacks.checkpoints.monitor=loss/total",
         "callbacks.checkpoints.mode=min",
     )
-    assert torch.load(tmp_path / "checkpoints/best.ckpt", weights_only=True)["global_step"] > 60
+    assert torch.load(tmp_path / "checkpoints/best.ckpt", weights_only=True)["global_step"] >= 48
 
 
 def test_filters_that_hold_frames_back_lose_none(run, tmp_path):
