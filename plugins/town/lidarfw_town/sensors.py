@@ -66,7 +66,7 @@ class Scene:
             TriangleMesh(self._scene, mesh.triangles)
 
     def cast(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32]]:
-        """Distance (N,), 1e37 for none, and triangle (N,), -1 for none, of the first hit; directions are of length 1."""
+        """Distance (N,), 1e37 for none, and triangle (N,), -1 for none, of the first hits of unit rays."""
         if not len(self.mesh):
             return np.full(len(origins), 1e37, np.float32), np.full(len(origins), -1, np.int32)
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)

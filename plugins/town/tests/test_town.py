@@ -1,0 +1,255 @@
+"""What the town promises: the same seed gives the same files, and the truth fits what the sensors measured."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lidarfw import kitti
+from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.errors import ConfigError, DataError
+from scipy.spatial import cKDTree
+
+from lidarfw_town.__main__ import main
+from lidarfw_town.bodies import KINDS, make
+from lidarfw_town.camera import Pinhole, kitti_camera
+from lidarfw_town.drive import Drive, TownFrame
+from lidarfw_town.generate import Job, drive_of, generate
+from lidarfw_town.layouts import labels_of
+from lidarfw_town.sensors import LIDARS, first_hits
+
+STEPS = 40
+PEOPLE_AND_VEHICLES = {10, 13, 18, 30, 31, 32, 252, 253, 254, 255, 257, 258}
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return Drive(1, STEPS, LIDARS["hdl64"])
+
+
+@pytest.fixture(scope="module")
+def frame(drive: Drive) -> TownFrame:
+    return drive.frame(20)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    job = Job("kitti", str(tmp_path_factory.mktemp("kitti")), seed=3, frames=2, sensor="small", picture_width=310)
+    generate(job, quiet=True)
+    return job
+
+
+def hashes(root: str) -> dict[str, str]:
+    files = sorted(path for path in Path(root).rglob("*") if path.is_file())
+    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_same_seed_gives_the_same_files(written: Job, tmp_path: Path) -> None:
+    drive_of.cache_clear()
+    again = Job("kitti", str(tmp_path), seed=3, frames=2, sensor="small", picture_width=310)
+    generate(again, quiet=True)
+    assert hashes(again.root) == hashes(written.root)
+    scan = (tmp_path / "training/velodyne/000000.bin").read_bytes()
+    assert scan != (tmp_path / "training/velodyne/000001.bin").read_bytes()
+
+
+def test_an_interrupted_run_goes_on(written: Job) -> None:
+    before = hashes(written.root)
+    root = Path(written.root)
+    last = written.places()[-1]
+    for path in (written.part(last), written.part(last).with_name("done"), root / "training/velodyne/000001.bin"):
+        path.unlink()
+    first = (root / "training/velodyne/000000.bin").stat().st_mtime_ns
+    generate(written, quiet=True)
+    assert hashes(written.root) == before
+    assert (root / "training/velodyne/000000.bin").stat().st_mtime_ns == first
+
+
+def test_another_seed_is_refused_in_the_same_folder(written: Job) -> None:
+    with pytest.raises(DataError, match="seed: 3 there, 4 now"):
+        generate(Job("kitti", written.root, seed=4, frames=2, sensor="small", picture_width=310), quiet=True)
+
+
+@pytest.mark.parametrize("wrong", [{"sensor": "vlp16"}, {"frames": 0}, {"weather": "snow"}])
+def test_wrong_settings_are_named(wrong: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        generate(Job("kitti", str(tmp_path), **wrong))  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_reports_errors_plainly(written: Job, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--out", written.root, "--frames", "5", "--seed", "3", "--sensor", "small"]) == 2
+    assert "other settings" in capsys.readouterr().err
+
+
+def test_the_core_loader_reads_the_files(written: Job) -> None:
+    dataset = KittiDataset(root=written.root, split="train", image=True)
+    dataset.prepare()
+    frame = dataset[1]
+    boxes = frame.targets.boxes
+    assert len(dataset) == 2
+    assert boxes is not None
+    assert len(boxes)
+    assert len(frame.inputs["points"]) > 1000
+    assert float(frame.inputs["points"].features.max()) <= 1
+
+
+def inside(points: np.ndarray, box: tuple[float, ...], margin: float) -> np.ndarray:
+    cosine, sine = np.cos(box[6]), np.sin(box[6])
+    local = (points[:, :3] - box[:3]) @ np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+    return (np.abs(local) <= np.array(box[3:6]) / 2 + margin).all(1)
+
+
+def test_points_of_an_object_lie_in_its_box(drive: Drive) -> None:
+    drive.compensated = True
+    frame = drive.frame(30)
+    drive.compensated = False
+    instance, semantic = frame.label >> 16, frame.label & 0xFFFF
+    assert len(frame.objects) > 10
+    for thing in frame.objects:
+        own = instance == thing.id
+        assert own.sum() == thing.points
+        # five times the noise of the range
+        assert inside(frame.points[own], thing.box, 0.1).all(), thing
+        kind = KINDS[thing.kind]
+        assert set(semantic[own].tolist()) <= {kind.moving if thing.moving else kind.semantic}
+    assert set(np.unique(instance).tolist()) - {0} <= {thing.id for thing in frame.objects}
+
+
+def test_boxes_fit_scans_with_ego_motion_in_them(frame: TownFrame) -> None:
+    instance = frame.label >> 16
+    for thing in frame.objects:
+        own = frame.points[instance == thing.id]
+        # right behind, a turn begins and ends: there objects are torn, as in real scans
+        if len(own) > 20 and np.abs(np.arctan2(own[:, 1], own[:, 0])).max() < 3.0:
+            assert inside(own, thing.box, 0.1).mean() > 0.9, thing
+
+
+def test_every_movable_point_belongs_to_an_object(frame: TownFrame) -> None:
+    movable = np.isin(frame.label & 0xFFFF, list(PEOPLE_AND_VEHICLES))
+    assert movable.any()
+    assert ((frame.label >> 16 > 0) == movable).all()
+
+
+def test_poses_align_consecutive_scans(tmp_path: Path) -> None:
+    job = Job("semantic_kitti", str(tmp_path), seed=1, frames=2, sensor="hdl64", picture_width=0)
+    generate(job, quiet=True)
+    folder = tmp_path / "dataset" / "sequences" / "00"
+    lines = (folder / "calib.txt").read_text().splitlines()
+    extrinsic = np.eye(4)
+    extrinsic[:3] = np.array(lines[4].split()[1:], float).reshape(3, 4)
+    clouds = []
+    for number, row in enumerate(np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)):
+        pose = np.linalg.inv(extrinsic) @ np.concatenate([row, [[0, 0, 0, 1]]]) @ extrinsic
+        points = np.fromfile(folder / "velodyne" / f"{number:06d}.bin", "<f4").reshape(-1, 4)[:, :3].astype(float)
+        label = np.fromfile(folder / "labels" / f"{number:06d}.label", "<u4") & 0xFFFF
+        assert len(label) == len(points)
+        flat = np.isin(label, (40, 44, 48, 50))
+        clouds.append(points[flat] @ pose[:3, :3].T + pose[:3, 3])
+    assert np.median(_distance_to_surface(*clouds)) < 0.03
+
+
+def _distance_to_surface(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distance of points of the second cloud from planes through their neighbours in the first."""
+    tree = cKDTree(first)
+    distance, index = tree.query(second[::20], k=12)
+    near = distance[:, -1] < 0.7
+    patch = first[index[near]]
+    middle = patch.mean(1)
+    _, values, axes = np.linalg.svd(patch - middle[:, None], full_matrices=False)
+    planar = values[:, 2] < 0.25 * values[:, 1]
+    assert planar.sum() > 300
+    offset = second[::20][near] - middle
+    return np.abs((offset * axes[:, 2]).sum(1))[planar]
+
+
+def test_labels_are_where_the_picture_shows_the_objects(drive: Drive, frame: TownFrame) -> None:
+    camera = kitti_camera(621)
+    checked = []
+    for one in (frame, drive.frame(35)):
+        shown = _pictured(drive, one, camera)
+        for thing in one.objects:
+            for label in labels_of([thing], camera):
+                if thing.id in shown and label.type != "DontCare" and label.truncation < 0.02:
+                    checked.append(_covered(shown[thing.id], label, whole=thing.visible > 0.95))
+    assert len(checked) >= 8
+
+
+def _covered(shown: tuple[float, ...], label: kitti.Label, *, whole: bool) -> float:
+    """The share of a label's rectangle that the object's pixels span; they must not leave it."""
+    left, top, right, bottom = shown
+    a, b, c, d = label.box2d
+    assert left >= a - 2
+    assert right <= c + 2
+    assert top >= b - 2
+    assert bottom <= d + 2
+    share = (right - left + 1) * (bottom - top + 1) / ((c - a) * (d - b))
+    assert share > 0.45 or not whole
+    return share
+
+
+def _pictured(drive: Drive, frame: TownFrame, camera: Pinhole) -> dict[int, tuple[float, ...]]:
+    """Instance -> left, top, right, bottom of its pixels."""
+    directions = np.ascontiguousarray(camera.rays().reshape(-1, 3) @ frame.pose[:3, :3].T.astype(np.float32))
+    place = (frame.pose[:3, :3] @ camera.place + frame.pose[:3, 3]).astype(np.float32)
+    origins = np.ascontiguousarray(np.broadcast_to(place, directions.shape))
+    instance = first_hits([drive.still, frame.movers], origins, directions).instance.reshape(camera.height, -1)
+    found = {}
+    for number in np.unique(instance[instance > 0]):
+        rows, columns = np.nonzero(instance == number)
+        found[int(number)] = (columns.min(), rows.min(), columns.max(), rows.max())
+    return found
+
+
+def test_frames_do_not_depend_on_the_order_of_calls(drive: Drive, frame: TownFrame) -> None:
+    drive.frame(21)
+    again = drive.frame(20)
+    assert (again.points == frame.points).all()
+    assert (again.label == frame.label).all()
+
+
+def test_the_scan_is_like_a_real_one(frame: TownFrame) -> None:
+    distance = np.linalg.norm(frame.points[:, :3], axis=1)
+    semantic, counts = np.unique(frame.label & 0xFFFF, return_counts=True)
+    share = dict(zip(semantic.tolist(), counts / len(frame.label)))
+    assert 95_000 < len(frame.points) < 131_072
+    assert 7 < np.median(distance) < 14
+    assert 0.25 < share[40] < 0.5
+    assert {10, 40, 48, 50, 70, 71, 72, 80} <= set(share)
+
+
+def test_the_town_has_loops_and_a_highway_and_half_full_slots(drive: Drive) -> None:
+    network = drive.world.network
+    assert len(network.streets) > len(network.nodes)
+    assert any(street.highway for street in network.streets)
+    assert 0.4 <= len(drive.traffic.parked) / len(drive.world.slots.yaw) <= 0.6
+
+
+def test_vehicles_do_not_drive_through_each_other(drive: Drive) -> None:
+    vehicles = [mover for mover in drive.traffic.movers if mover.kind != "pedestrian"]
+    places = np.stack([drive.traffic.ego, *(mover.track for mover in vehicles)])[..., :2]
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    apart[np.arange(len(places)), np.arange(len(places))] = np.inf
+    assert len(vehicles) > 10
+    assert apart.min() > 1.5
+
+
+def test_another_traversal_parks_others_and_keeps_some(drive: Drive) -> None:
+    other = Drive(1, 2, LIDARS["small"], traversal=1)
+    assert (other.world.mesh.triangles == drive.world.mesh.triangles).all()
+    here, there = ({(p.id, *p.pose.tolist()) for p in d.traffic.parked} for d in (drive, other))
+    assert 0.1 < len(here & there) / len(here) < 0.6
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_bodies_fill_their_size_and_walk(kind: str) -> None:
+    body = make(kind, (1, 2))
+    low, high = body.triangles.min((0, 1)), body.triangles.max((0, 1))
+    assert len(body) > 60
+    assert low[2] == pytest.approx(0, abs=1e-4)
+    assert (low + high)[:2] == pytest.approx(0, abs=1e-3)
+    assert (make(kind, (1, 2)).triangles == body.triangles).all()
+    if kind == "pedestrian":
+        assert not np.allclose(make(kind, (1, 2), 1.5).triangles, body.triangles, atol=0.05)
