@@ -156,7 +156,9 @@ def test_a_worker_that_dies_while_the_model_works(run, tmp_path, monkeypatch):
         return step(self, batch, batch_idx)
 
     monkeypatch.setattr(PerceptionModule, "training_step", kill_worker)
-    with pytest.raises(DataError, match=r"worker died: DataLoader worker .* (is killed by signal|exited unexpectedly)") as error:
+    with pytest.raises(
+        DataError, match=r"worker died: DataLoader worker .* (is killed by signal|exited unexpectedly)"
+    ) as error:
         run(tmp_path, "loader.workers=1")
     assert "the batch that was waited for: train" in str(error.value)
 
