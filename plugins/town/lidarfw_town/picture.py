@@ -66,7 +66,10 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
     order = np.argsort(mesh.triangles[..., 2].mean(1))
     axes.add_collection(
         PolyCollection(
-            list(mesh.triangles[order][..., :2]), facecolors=colours_of(mesh.semantic[order]), rasterized=True
+            list(mesh.triangles[order][..., :2]),
+            facecolors=colours_of(mesh.semantic[order]),
+            antialiased=False,
+            linewidths=0,
         )
     )
     axes.plot(*drive.traffic.ego[:, :2].T, color="#C2185B", linewidth=2, label="route of a minute")
@@ -99,7 +102,9 @@ def _draw_scan(axes: Axes, frame: TownFrame) -> None:
             colour = "#B71C1C" if thing.moving else "#111111"
             axes.plot(*_outline(thing.box).T, color=colour, linewidth=1.2)
             if KINDS[thing.kind].name != "Pedestrian":
-                axes.annotate(str(thing.id), thing.box[:2], fontsize=6, color=colour, ha="center", va="center")
+                axes.annotate(
+                    str(thing.id), (thing.box[0], thing.box[1]), fontsize=6, color=colour, ha="center", va="center"
+                )
     names = [name for name in _COLOURS if name != "nothing"]
     handles = [Patch(color=_COLOURS[name], label=name) for name in names]
     axes.legend(handles=handles, loc="lower right", fontsize=8, framealpha=0.9)

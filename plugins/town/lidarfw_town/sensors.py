@@ -139,7 +139,7 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
     )
     lost = rng.random(len(signal)) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
     glassy = (hits.reflectance < 0.08) & (rng.random(len(signal)) < 0.55)
-    gone = lost | glassy | (hits.distance > lidar.farthest) | _own_roof(directions)
+    gone = lost | glassy | (hits.distance > lidar.farthest) | _own_roof(lidar.rays()[0].reshape(-1, 3))
     distance = hits.distance + rng.normal(0, lidar.noise, len(signal)).astype(np.float32)
     distance = np.where(gone, 0, distance).reshape(shape).astype(np.float32)
     mixed = _mix(distance, rng)
@@ -170,7 +170,7 @@ def _mix(distance: Floats, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
 
 
 def _own_roof(directions: Floats) -> npt.NDArray[np.bool_]:
-    """Rays that the roof of the own vehicle stops, 0.45 m below the sensor and 0.65 m to each side."""
+    """Rays, in the axes of the sensor, that the own roof stops: 0.45 m below, 0.65 m to each side."""
     down = np.minimum(directions[:, 2], -1e-6)
     ahead, aside = -0.45 * directions[:, 0] / down, -0.45 * directions[:, 1] / down
     return np.asarray((ahead < 0.6) & (ahead > -1.3) & (np.abs(aside) < 0.65))

@@ -215,7 +215,7 @@ class World:
             draw = rng.random()
             if number % 4 == 2 * side:
                 parts.append(self.on_ground(furniture.lamp(rng), place, yaw + np.pi / 2))
-            elif trees and draw < 0.4:
+            elif trees and draw < 0.5:
                 parts.append(self.on_ground(furniture.tree(rng), place, draw * 50))
             elif draw > 0.9:
                 parts.append(self.on_ground(furniture.sign(rng), place, yaw + np.pi))
@@ -260,7 +260,7 @@ class World:
         taken = shapely.unary_union([self.paved.buffer(PAVEMENT_WIDTH + 1.6), *(h.buffer(1.5) for h in self.houses)])
         shapely.prepare(taken)
         parts = []
-        for place in rng.uniform(low, high, (int((high - low).prod() / 170), 2)):
+        for place in rng.uniform(low, high, (int((high - low).prod() / 100), 2)):
             if shapely.contains_xy(taken, *place):
                 continue
             kind = rng.random()
