@@ -39,6 +39,7 @@ class Boxes(Rows):
     truncation: Tensor | None = None  # (M,) 0..1 share outside the picture
     alpha: Tensor | None = None  # (M,) observation angle in the picture, radians: heading less bearing
     row: Tensor | None = None  # (M,) int64, place of the object in its label file
+    attribute: Tensor | None = None  # (M,) int64, what the object does, by the dataset's numbers; -1 not known
 
     @property
     def tensor(self) -> Tensor:
