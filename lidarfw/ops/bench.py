@@ -175,21 +175,26 @@ def forward_times(net: nn.Module, voxels: Voxels, rounds: int) -> list[float]:
 def _backbone_cases(name: str, voxels: Voxels, against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
     torch.manual_seed(0)
     net = backbone(voxels.features.shape[1]).eval()
+    fused = ops.fuse(net)
     text = f"{name}, {len(voxels)} voxels"
 
     def forward() -> Any:
         with torch.no_grad():
             return net(fresh(voxels))
 
+    def forward_fused() -> Any:
+        with torch.no_grad():
+            return fused(fresh(voxels))
+
     def forward_naive() -> Any:
-        with torch.no_grad(), mock.patch.object(sparse_conv, "_convolve", naive.convolve):
+        with torch.no_grad(), mock.patch.object(sparse_conv, "convolve", naive.convolve):
             return net(fresh(voxels))
 
     def train() -> None:
         features = voxels.features.clone().requires_grad_()
         net(fresh(voxels, features)).features.square().mean().backward()
 
-    candidates: dict[str, Run] = {"ours": forward, "naive": forward_naive}
+    candidates: dict[str, Run] = {"ours": forward, "ours, fused": forward_fused, "naive": forward_naive}
     train_candidates: dict[str, Run] = {"ours": train}
     if "spconv" in against:
         rival = rivals.spconv_backbone(CHANNELS, voxels.features.shape[1]).eval()
@@ -215,7 +220,7 @@ def _layer_cases(voxels: Voxels) -> Iterator[tuple[str, dict[str, Run]]]:
         features = torch.randn(len(voxels), channels, generator=torch.Generator().manual_seed(0))
         weight = torch.randn(27, channels, channels, generator=torch.Generator().manual_seed(1))
         runs: dict[str, Run] = {
-            "ours": partial(sparse_conv._convolve, features, weight, book),
+            "ours": partial(sparse_conv.convolve, features, weight, book),
             "naive": partial(naive.convolve, features, weight, book),
         }
         yield f"submanifold layer, {channels} channels, {len(voxels)} voxels", runs

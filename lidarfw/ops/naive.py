@@ -13,7 +13,9 @@ from lidarfw.ops.rulebook import Rulebook
 from lidarfw.types import Grid, Points, RangeImage, RangeView
 
 
-def convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
+def convolve(
+    features: Tensor, weight: Tensor, book: Rulebook, bias: Tensor | None = None, rectify: bool = False
+) -> Tensor:
     """Sparse convolution element by element: gather, multiply, `index_add_`."""
     output = features.new_zeros(book.num_outputs, weight.shape[2])
     inputs, outputs = book.inputs.long(), book.outputs.long()
@@ -22,7 +24,9 @@ def convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
         rows = slice(start, start + count)
         output.index_add_(0, outputs[rows], features[inputs[rows]] @ weight[element])
         start += count
-    return output + features @ weight[book.volume // 2] if book.symmetric else output
+    output = output + features @ weight[book.volume // 2] if book.symmetric else output
+    output = output if bias is None else output + bias
+    return output.relu() if rectify else output
 
 
 def voxelize_mean(points: Points, grid: Grid) -> tuple[Tensor, Tensor]:

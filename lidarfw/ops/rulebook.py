@@ -56,10 +56,16 @@ class Block:
     """
 
     rows: slice  # output rows
-    groups: list[tuple[Tensor, Tensor, int]]  # input rows, output rows and kernel element of a run of pairs
-    pairs: int
+    inputs: tuple[Tensor, ...]  # input rows of each run of pairs under one kernel element
+    outputs: tuple[Tensor, ...]  # output rows of each run
+    elements: tuple[int, ...]  # kernel element of each run
+    sizes: tuple[int, ...]  # pairs in each run
     order: Tensor  # (pairs,) int32 pairs of the block sorted by output row
     starts: Tensor  # (rows + 1,) int32: row r of the block owns order[starts[r]:starts[r + 1]]
+
+    @property
+    def pairs(self) -> int:
+        return sum(self.sizes)
 
 
 @dataclass
@@ -115,8 +121,7 @@ class Rulebook:
         return self._blocks
 
     def _mirrored(self, block: Block) -> Block:
-        groups = [(inputs, outputs, self.volume - 1 - element) for inputs, outputs, element in block.groups]
-        return replace(block, groups=groups)
+        return replace(block, elements=tuple(self.volume - 1 - element for element in block.elements))
 
     def _bounds(self, first_rows: Tensor) -> Tensor:
         """(blocks + 1, groups) int64 pair at which each group's part of each block begins, and the groups' ends."""
@@ -130,14 +135,15 @@ class Rulebook:
         return inside + (sizes.cumsum(0) - sizes)
 
     def _block(self, rows: slice, begin: list[int], end: list[int], starts: Tensor) -> Block:
-        runs = [(slice(a, b), element) for a, b, element in zip(begin, end, self.elements, strict=True) if b > a]
-        groups = [(self.inputs[run], self.outputs[run], element) for run, element in runs]
-        outputs = torch.cat([g[1] for g in groups] or [self.outputs[:0]])
-        own = starts[rows.start : rows.stop + 1]
-        narrow = rows.stop - rows.start < 2**15  # fewer digits for the radix sort
-        outputs = (outputs - rows.start).short() if narrow else outputs
-        order = torch.sort(outputs, stable=True)[1].int()
-        return Block(rows, groups, len(outputs), order, (own - own[0]).int())
+        bounds = zip(begin, end, self.elements, strict=True)
+        runs, elements = zip(*[(slice(a, b), e) for a, b, e in bounds if b > a] or [(slice(0), 0)], strict=True)
+        inputs, outputs = (tuple(side[run] for run in runs) for side in (self.inputs, self.outputs))
+        local = torch.cat(outputs)
+        if rows.stop - rows.start < 2**15:  # fewer digits for the radix sort
+            local = (local - rows.start).short()
+        order, own = torch.sort(local, stable=True)[1].int(), starts[rows.start : rows.stop + 1]
+        sizes = tuple(run.stop - (run.start or 0) for run in runs)
+        return Block(rows, inputs, outputs, elements, sizes, order, (own - own[0]).int())
 
 
 @dataclass

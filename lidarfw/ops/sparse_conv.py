@@ -26,37 +26,42 @@ from lidarfw.ops.scratch import scratch
 from lidarfw.types import Voxels
 
 
-def _convolve(features: Tensor, weight: Tensor, book: Rulebook) -> Tensor:
+def convolve(
+    features: Tensor, weight: Tensor, book: Rulebook, bias: Tensor | None = None, rectify: bool = False
+) -> Tensor:
     """(num_outputs, C_out): every pair's input row times the weight of its element, summed by output row.
 
     Block by block: per element gather the rows, multiply; then sum the products, and add the product of
-    the centre, which is an identity and needs no gathering.
+    the centre, which is an identity and needs no gathering. Not differentiable.
+
+    Args:
+        bias: (C_out,) added to every row.
+        rectify: set what is negative to 0, while the block is in the cache.
     """
+    blocks, weights = book.blocks(), weight.unbind()
     output = features.new_empty(book.num_outputs, weight.shape[2])
-    weights = weight.unbind()
-    for block in book.blocks():
+    for block in blocks:
         products = scratch("products", block.pairs, weight.shape[2], features)
-        at = 0
-        for inputs, _, element in block.groups:
-            rows = gather(features, inputs, "rows")
-            torch.mm(rows, weights[element], out=products[at : at + len(inputs)])
-            at += len(inputs)
-        sum_block(block, products, output)
+        buffer = scratch("rows", max(block.sizes), weight.shape[1], features)
+        runs = zip(block.inputs, block.sizes, block.elements, products.split_with_sizes(block.sizes), strict=True)
+        for inputs, size, element, product in runs:
+            torch.mm(torch.index_select(features, 0, inputs, out=buffer[:size]), weights[element], out=product)
+        total = sum_block(block, products)
         if book.symmetric:
-            output[block.rows].addmm_(features[block.rows], weights[book.volume // 2])
+            total.addmm_(features[block.rows], weights[book.volume // 2])
+        total = total if bias is None else total.add_(bias)
+        total = total.relu_() if rectify else total
+        if len(blocks) == 1:
+            return total
+        output[block.rows] = total
     return output
 
 
-def gather(features: Tensor, rows: Tensor, name: str) -> Tensor:
-    return torch.index_select(features, 0, rows, out=scratch(name, len(rows), features.shape[1], features))
-
-
-def sum_block(block: Block, products: Tensor, output: Tensor) -> None:
-    """Write the sums of the products (pairs, C) to the block's rows of the output."""
-    if block.pairs:
-        output[block.rows] = F.embedding_bag(block.order, products, block.starts, mode="sum", include_last_offset=True)
-    else:
-        output[block.rows] = 0
+def sum_block(block: Block, products: Tensor) -> Tensor:
+    """(rows, C) sums of the products (pairs, C) of a block."""
+    if not block.pairs:
+        return products.new_zeros(block.rows.stop - block.rows.start, products.shape[1])
+    return F.embedding_bag(block.order, products, block.starts, mode="sum", include_last_offset=True)
 
 
 class _Convolution(torch.autograd.Function):
@@ -67,7 +72,7 @@ class _Convolution(torch.autograd.Function):
         ctx.save_for_backward(features, weight)
         ctx.book = book
         with torch.autocast(features.device.type, enabled=False):
-            return _convolve(features, weight, book)
+            return convolve(features, weight, book)
 
     @staticmethod
     @once_differentiable
@@ -90,16 +95,24 @@ def _gradients(
     d_weight = torch.zeros_like(weight) if need_weight else None
     for block in book.blocks():
         products = scratch("products", block.pairs, weight.shape[1], gradient)
-        at = 0
-        for inputs, outputs, element in block.groups:
-            rows = gather(gradient, inputs, "rows")
+        arrived = scratch("rows", max(block.sizes), weight.shape[2], gradient)
+        seen = scratch("features", max(block.sizes), weight.shape[1], features)
+        runs = zip(
+            block.inputs,
+            block.outputs,
+            block.sizes,
+            block.elements,
+            products.split_with_sizes(block.sizes),
+            strict=True,
+        )
+        for inputs, outputs, size, element, product in runs:
+            rows = torch.index_select(gradient, 0, inputs, out=arrived[:size])
             if d_weight is not None:
-                d_weight[element].addmm_(gather(features, outputs, "features").t(), rows)
+                d_weight[element].addmm_(torch.index_select(features, 0, outputs, out=seen[:size]).t(), rows)
             if need_features:
-                torch.mm(rows, flipped[element], out=products[at : at + len(inputs)])
-            at += len(inputs)
+                torch.mm(rows, flipped[element], out=product)
         if d_features is not None:
-            sum_block(block, products, d_features)
+            d_features[block.rows] = sum_block(block, products)
     if book.symmetric:
         centre = book.volume // 2
         if d_features is not None:
@@ -148,6 +161,7 @@ class SparseConvolution(SparseModule):
         self.in_channels, self.out_channels, self.kernel = in_channels, out_channels, kernel
         self.weight = nn.Parameter(torch.empty(kernel.volume, in_channels, out_channels))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
+        self.rectify = False  # set by `fuse`: a ReLU is part of the layer
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -169,8 +183,13 @@ class SparseConvolution(SparseModule):
                 f"{type(self).__name__}: voxels have {features.shape[1]} channels, the layer takes {self.in_channels}"
             )
         features, weight = _compute_types(features, self.weight)
+        bias = None if self.bias is None else self.bias.to(weight.dtype)
+        if not torch.is_grad_enabled():
+            with torch.autocast(features.device.type, enabled=False):
+                return convolve(features.contiguous(), weight, book, bias, self.rectify)
         output = cast(Tensor, _Convolution.apply(features.contiguous(), weight, book))  # type: ignore[no-untyped-call]
-        return output if self.bias is None else output.add_(self.bias.to(output.dtype))
+        output = output if bias is None else output.add_(bias)
+        return output.relu_() if self.rectify else output
 
 
 class SubmanifoldConv3d(SparseConvolution):

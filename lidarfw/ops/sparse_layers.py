@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from itertools import pairwise
 from typing import Any, cast
 
 import torch
@@ -11,7 +10,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from lidarfw.ops.rulebook import Kernel, Rulebook, strided_rulebook
-from lidarfw.ops.sparse_conv import SparseConvolution, SparseModule, gather, strided_voxels, sum_block, triple
+from lidarfw.ops.scratch import scratch
+from lidarfw.ops.sparse_conv import SparseConvolution, SparseModule, strided_voxels, sum_block, triple
 from lidarfw.types import Grid, Voxels
 
 
@@ -65,11 +65,11 @@ class _PairSum(torch.autograd.Function):
 
 
 def _pair_sum(features: Tensor, book: Rulebook) -> Tensor:
-    output = features.new_empty(book.num_outputs, features.shape[1])
+    sums = []
     for block in book.blocks():
-        inputs = torch.cat([inputs for inputs, _, _ in block.groups] or [book.inputs[:0]])
-        sum_block(block, gather(features, inputs, "products"), output)
-    return output
+        rows = scratch("products", block.pairs, features.shape[1], features)
+        sums.append(sum_block(block, torch.index_select(features, 0, torch.cat(block.inputs), out=rows)))
+    return torch.cat(sums)
 
 
 class SparseSequential(SparseModule, nn.Sequential):
@@ -85,25 +85,29 @@ class SparseSequential(SparseModule, nn.Sequential):
 
 
 def fuse(module: nn.Module) -> nn.Module:
-    """A copy for inference in which batch normalisation after a sparse convolution is part of its weights.
+    """A copy for inference in which what follows a sparse convolution is part of it.
 
-    Within each `SparseSequential` a convolution directly followed by `BatchNorm1d` becomes one with a bias, and a
-    ReLU after it works in place. The copy is in eval mode and must stay in it.
+    Within each `SparseSequential`, `BatchNorm1d` directly after a convolution goes into its weight and bias, and
+    a ReLU after that is applied to each block of rows while it is in the cache. The copy is in eval mode and must
+    stay in it.
     """
     fused = copy.deepcopy(module).eval()
     for sequence in [m for m in fused.modules() if isinstance(m, SparseSequential)]:
-        children = list(sequence.named_children())
-        for (name, first), (next_name, second) in pairwise(children):
-            if isinstance(first, SparseConvolution) and isinstance(second, nn.BatchNorm1d):
-                setattr(sequence, name, _folded(first, second))
-                delattr(sequence, next_name)
-            elif isinstance(first, nn.BatchNorm1d) and isinstance(second, nn.ReLU):
-                second.inplace = True
+        convolution: SparseConvolution | None = None
+        for name, layer in list(sequence.named_children()):
+            if convolution is not None and not convolution.rectify and isinstance(layer, nn.BatchNorm1d):
+                _fold(convolution, layer)
+                delattr(sequence, name)
+            elif convolution is not None and isinstance(layer, nn.ReLU):
+                convolution.rectify = True
+                delattr(sequence, name)
+            else:
+                convolution = layer if isinstance(layer, SparseConvolution) else None
     return fused
 
 
-def _folded(convolution: SparseConvolution, norm: nn.BatchNorm1d) -> SparseConvolution:
-    """The convolution with the affine map of the norm in eval mode in its weight and bias."""
+def _fold(convolution: SparseConvolution, norm: nn.BatchNorm1d) -> None:
+    """Put the affine map of the norm in eval mode into the convolution's weight and bias."""
     if norm.running_mean is None or norm.running_var is None:
         raise ValueError("fuse: a batch normalisation without running statistics cannot be part of a convolution")
     with torch.no_grad():
@@ -112,7 +116,6 @@ def _folded(convolution: SparseConvolution, norm: nn.BatchNorm1d) -> SparseConvo
         bias = shift if convolution.bias is None else shift + convolution.bias * gain
         convolution.weight.mul_(gain)
         convolution.bias = nn.Parameter(bias)
-    return convolution
 
 
 def to_dense(voxels: Voxels) -> Tensor:

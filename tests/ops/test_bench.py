@@ -37,7 +37,7 @@ def test_naive_versions_give_what_ours_give(scan) -> None:
         rulebook.strided_rulebook(voxels, rulebook.Kernel((3, 3, 3), (2, 2, 2), (1, 1, 1))).book,
     ):
         weight = torch.randn(27, 4, 8, generator=torch.Generator().manual_seed(0))
-        ours = sparse_conv._convolve(voxels.features, weight, book)
+        ours = sparse_conv.convolve(voxels.features, weight, book)
         torch.testing.assert_close(naive.convolve(voxels.features, weight, book), ours, rtol=1e-4, atol=1e-3)
     image = ops.range_project(scan, bench.VIEW)
     plain = torch.from_numpy(naive.range_project(scan.xyz.numpy(), scan.features.numpy(), bench.VIEW))
@@ -74,7 +74,7 @@ def test_naive_pose_scores_find_the_pose_that_ours_finds() -> None:
 def test_floating_point_operations_are_counted_from_the_pairs(scan, monkeypatch) -> None:
     voxels = ops.voxelize_mean(scan, bench.GRID)
     net = bench.backbone(4).eval()
-    monkeypatch.setattr(sparse_conv, "_convolve", naive.convolve)  # the counter does not see products into scratch
+    monkeypatch.setattr(sparse_conv, "convolve", naive.convolve)  # the counter does not see products into scratch
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
         net(bench.fresh(voxels))
     assert bench.flops(bench.fresh(voxels)) == pytest.approx(counter.get_total_flops(), rel=1e-6)
