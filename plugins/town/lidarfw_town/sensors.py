@@ -49,10 +49,10 @@ def _even(up: float, down: float, count: int) -> tuple[float, ...]:
 
 
 LIDARS = {
-    "hdl64": Lidar("hdl64", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 2048, 0.02, 120.0, 0.006),
+    "hdl64": Lidar("hdl64", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 2048, 0.02, 80.0, 0.006),
     "hdl32": Lidar("hdl32", _even(10.67, -30.67, 32), 2048, 0.02, 100.0, 0.008, 1.84),
     "ouster32": Lidar("ouster32", _even(22.5, -22.5, 32), 1024, 0.015, 120.0, 0.008, 1.8),
-    "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 100.0, 0.006),
+    "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 80.0, 0.006),
 }
 
 
@@ -154,7 +154,7 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
 
 def _remission(hits: Hits, cosine: Floats, signal: Floats, rng: np.random.Generator) -> Floats:
     """Calibrated remission: mostly the reflectance, weaker at grazing incidence, 0 where the pulse was faint."""
-    value = hits.reflectance * (0.62 + 0.48 * cosine) * rng.normal(1, 0.13, len(cosine))
+    value = hits.reflectance * (0.86 + 0.24 * cosine) * rng.normal(1, 0.13, len(cosine))
     faint = rng.random(len(cosine)) < 1 / (1 + (signal / 0.02) ** 1.5)
     # levels of a hundredth, as the devices give them
     return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)

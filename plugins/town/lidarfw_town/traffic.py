@@ -28,7 +28,7 @@ from lidarfw_town.streets import (
 from lidarfw_town.world import SLOT, World
 
 PERIOD = 0.1  # seconds from frame to frame
-_ON_ROAD = ("car",) * 20 + ("van",) * 4 + ("truck",) * 4 + ("bus",) * 2 + ("cyclist",) * 5 + ("motorcyclist",) * 2
+_ON_ROAD = ("car",) * 20 + ("van",) * 4 + ("truck",) * 4 + ("bus",) * 2 + ("cyclist",) * 14 + ("motorcyclist",) * 2
 _PARKED = ("car",) * 12 + ("van",) * 2
 _ACCELERATION, _BRAKING, _HEADWAY, _GAP = 1.4, 2.2, 1.3, 2.5  # of the driver model: m/s2, m/s2, seconds, metres
 _SIDEWAYS = 2.2  # m/s2 that a driver takes in curves
@@ -102,7 +102,7 @@ class Traffic:
             parked.append(Parked(10000 + int(slot), kind, seed, np.array([*place, yaw])))
         return parked
 
-    def _drive(self, steps: int, count: int = 34) -> list[Mover]:
+    def _drive(self, steps: int, count: int = 46) -> list[Mover]:
         rng, network = self._rng, self._world.network
         kinds = ["car", *(str(_ON_ROAD[int(i)]) for i in rng.integers(len(_ON_ROAD), size=count))]
         paths, limits, lengths, starts = [], [], [], []

@@ -151,11 +151,16 @@ class World:
                 if street.highway:
                     continue
                 edge = LANE + PARKING_WIDTH * street.parking[side] + PAVEMENT_WIDTH
-                at, end = 13.0, float(arc_length(line)[-1]) - 13.0
-                while at < end:
-                    width = float(self._rng.uniform(8, 19))
-                    parts += self._plot(line, at, width, edge)
-                    at += width + float(self._rng.choice([0.0, 2.5, 4.0, 9.0], p=[0.25, 0.3, 0.3, 0.15]))
+                parts += self._row_of_plots(line, edge) + self._row_of_plots(line, edge + 27.0)
+        return parts
+
+    def _row_of_plots(self, line: Array, edge: float) -> list[Mesh]:
+        parts = []
+        at, end = 13.0, float(arc_length(line)[-1]) - 13.0
+        while at < end:
+            width = float(self._rng.uniform(8, 19))
+            parts += self._plot(line, at, width, edge)
+            at += width + float(self._rng.choice([0.0, 2.5, 4.0, 9.0], p=[0.25, 0.3, 0.3, 0.15]))
         return parts
 
     def _plot(self, line: Array, at: float, width: float, edge: float) -> list[Mesh]:
@@ -163,7 +168,7 @@ class World:
         whole, along = _line(line, at, at + width), float(rng.uniform(8, 13))
         if len(whole) < 2:
             return []
-        setback = float(rng.choice([0.3, 2.5, 4.5, 7.0], p=[0.25, 0.25, 0.25, 0.25]))
+        setback = float(rng.choice([0.3, 3.0, 6.0, 9.0], p=[0.2, 0.25, 0.3, 0.25]))
         middle, yaw = whole[len(whole) // 2], float(headings(whole)[len(whole) // 2])
         right = np.array([np.sin(yaw), -np.cos(yaw)])
         place = middle + right * (edge + setback + along / 2)
@@ -260,11 +265,11 @@ class World:
         taken = shapely.unary_union([self.paved.buffer(PAVEMENT_WIDTH + 1.6), *(h.buffer(1.5) for h in self.houses)])
         shapely.prepare(taken)
         parts = []
-        for place in rng.uniform(low, high, (int((high - low).prod() / 100), 2)):
+        for place in rng.uniform(low, high, (int((high - low).prod() / 75), 2)):
             if shapely.contains_xy(taken, *place):
                 continue
             kind = rng.random()
-            what = furniture.tree if kind < 0.5 else furniture.bush if kind < 0.94 else furniture.boulder
+            what = furniture.tree if kind < 0.6 else furniture.bush if kind < 0.95 else furniture.boulder
             parts.append(self.on_ground(what(rng), place, float(rng.uniform(0, 6.28))))
         return parts
 
