@@ -10,7 +10,7 @@ import os
 import queue
 from collections.abc import Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +194,7 @@ def drive_of(job: Job, number: int) -> Drive:
 
 def make_frame(job: Job, place: Place) -> None:
     """Make one frame and write its files; its note comes last, so that an interrupted frame is made again."""
-    drive = drive_of(job, place.drive)
+    drive = drive_of(replace(job, root=""), place.drive)  # where the files go does not change the town
     frame = drive.frame(_LEAD + place.index * job.step)
     part = job.writer().write(frame, drive, place)
     write_text(job.part(place), json.dumps(part))

@@ -215,7 +215,7 @@ def test_the_scan_is_like_a_real_one(frame: TownFrame) -> None:
     semantic, counts = np.unique(frame.label & 0xFFFF, return_counts=True)
     share = dict(zip(semantic.tolist(), counts / len(frame.label)))
     assert 95_000 < len(frame.points) < 131_072
-    assert 7 < np.median(distance) < 14
+    assert 5 < np.median(distance) < 15
     assert 0.25 < share[40] < 0.5
     assert {10, 40, 48, 50, 70, 71, 72, 80} <= set(share)
 
