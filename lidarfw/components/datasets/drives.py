@@ -17,10 +17,11 @@ from lidarfw._lazy import LazyModule
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces.data import Dataset
 from lidarfw.io import read_points
-from lidarfw.types import FrameMeta, Points, Poses
+from lidarfw.types import Boxes, FrameMeta, Points, Poses
 
 if TYPE_CHECKING:
     import torch
+    from torch import Tensor
 else:
     torch = LazyModule("torch")
 
@@ -218,6 +219,35 @@ def read_ids(path: Path, count: int) -> npt.NDArray[np.uint32]:
     return np.frombuffer(data, "<u4")
 
 
+def read_boxes(path: Path, classes: Sequence[str], tracks: bool = False) -> tuple[Boxes, Tensor]:
+    """Boxes of the classes and their track ids (M,), -1 where not given; boxes of other names are left out.
+
+    A line is class x y z l w h yaw in lidarfw's conventions, and a whole number, the track id, which must be there
+    with `tracks`. DataError names the line that is wrong.
+    """
+    lines = [(i, line.split()) for i, line in enumerate(kitti.read_text(path).splitlines(), 1) if line.strip()]
+    for number, words in lines:
+        if len(words) != 9 and (tracks or len(words) != 8):
+            expected = "9 columns (class x y z l w h yaw track)" if tracks else "8 columns (class x y z l w h yaw)"
+            raise DataError(f"{path}, line {number}: expected {expected}, found {len(words)}: {' '.join(words)[:80]}")
+    rows = [(words[0], _numbers(words[1:], f"{path}, line {number}")) for number, words in lines]
+    rows = [(name, values) for name, values in rows if name in classes]
+    label = torch.tensor([classes.index(name) for name, _ in rows], dtype=torch.long)
+    table = torch.tensor([values[:7] for _, values in rows], dtype=torch.float32).view(-1, 7)
+    track = torch.tensor([int(values[7]) if len(values) > 7 else -1 for _, values in rows], dtype=torch.long)
+    return Boxes.from_tensor(table, label), track
+
+
+def _numbers(words: list[str], where: str) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{where}: expected numbers after the class: {error}") from None
+    if not np.isfinite(values).all() or min(values[3:6]) <= 0:
+        raise DataError(f"{where}: expected finite numbers and positive l w h, found {' '.join(words)}")
+    return values
+
+
 def scans_in(folder: Path, suffix: str = ".bin") -> list[Path]:
     """Files of a folder in order of their number; DataError where there is no such folder or a name is no number."""
     if not folder.is_dir():
@@ -227,3 +257,28 @@ def scans_in(folder: Path, suffix: str = ".bin") -> list[Path]:
         if not file.stem.isdigit():
             raise DataError(f"{file}: expected a number as the name, as in 000000{suffix}")
     return files
+
+
+def interpolated(times: Array, poses: Array, wanted: Array) -> Array:
+    """Poses (N, 4, 4) at the `wanted` times (N,), between poses (M, 4, 4) at rising `times` (M,).
+
+    Positions are interpolated linearly, rotations along the shortest arc. Wanted times lie within `times`.
+    """
+    from scipy.spatial.transform import Rotation, Slerp  # slow to import
+
+    matrices = np.tile(np.eye(4), (len(wanted), 1, 1))
+    if len(wanted):
+        matrices[:, :3, :3] = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(wanted).as_matrix()
+        matrices[:, :3, 3] = np.stack([np.interp(wanted, times, poses[:, axis, 3]) for axis in range(3)], 1)
+    return matrices
+
+
+def from_angles(rows: Array) -> Array:
+    """Transforms (N, 4, 4) of rows (N, 6) x, y, z, roll, pitch, yaw in radians: Rz(yaw) Ry(pitch) Rx(roll)."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    matrices = np.tile(np.eye(4), (len(rows), 1, 1))
+    if len(rows):
+        matrices[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, [5, 4, 3]]).as_matrix()
+    matrices[:, :3, 3] = rows[:, :3]
+    return matrices

@@ -12,7 +12,16 @@ import numpy.typing as npt
 
 from lidarfw import kitti
 from lidarfw._lazy import LazyModule
-from lidarfw.components.datasets.drives import Array, Drive, DriveDataset, pose_of, read_ids, read_poses, read_table
+from lidarfw.components.datasets.drives import (
+    Array,
+    Drive,
+    DriveDataset,
+    pose_of,
+    read_boxes,
+    read_ids,
+    read_poses,
+    read_table,
+)
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.io import SCAN_READERS, read_points
 from lidarfw.types import Boxes, DataSpec, Frame, PointLabels, Points, Poses, Spec, Targets, Tracks
@@ -145,23 +154,8 @@ class FolderDataset(DriveDataset):
 
     def _objects(self, scan: Path) -> Targets:
         """Boxes of the classes, and tracks where asked for."""
-        path = _beside(scan, "boxes", ".txt")
-        lines = [(i, line.split()) for i, line in enumerate(kitti.read_text(path).splitlines(), 1) if line.strip()]
-        columns = 9 if self.tracks else 8
-        for number, words in lines:
-            if len(words) not in (columns, 9):
-                raise DataError(
-                    f"{path}, line {number}: expected {columns} columns (class x y z l w h yaw"
-                    f"{' track' if self.tracks else ''}), found {len(words)}: {' '.join(words)[:80]}"
-                )
-        lines = [(number, words) for number, words in lines if words[0] in self.classes]
-        table = np.array([_numbers(words[1:], f"{path}, line {i}") for i, words in lines]).reshape(len(lines), -1)
-        label = torch.tensor([self.classes.index(words[0]) for _, words in lines], dtype=torch.long)
-        values = table[:, :7] if len(lines) else np.zeros((0, 7))
-        boxes = Boxes.from_tensor(torch.tensor(values, dtype=torch.float32), label)
-        if not self.tracks:
-            return Targets(boxes=boxes)
-        return Targets(boxes=boxes, tracks=Tracks(boxes, torch.tensor([int(row[7]) for row in table.tolist()]).long()))
+        boxes, track = read_boxes(_beside(scan, "boxes", ".txt"), self.classes, tracks=self.tracks)
+        return Targets(boxes=boxes, tracks=Tracks(boxes, track) if self.tracks else None)
 
     def _point_labels(self, files: list[Path], scans: list[Points]) -> PointLabels:
         parts = [self._ids(_beside(file, "labels", ".label"), len(scan)) for file, scan in zip(files, scans)]
@@ -176,16 +170,6 @@ class FolderDataset(DriveDataset):
         if (raw & 0xFFFF).max(initial=0) > len(self.classes):
             raise DataError(f"{path}: expected labels 0 .. {len(self.classes)}, found {(raw & 0xFFFF).max()}")
         return raw
-
-
-def _numbers(words: list[str], where: str) -> list[float]:
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise DataError(f"{where}: expected numbers after the class: {error}") from None
-    if not np.isfinite(values).all() or min(values[3:6]) <= 0:
-        raise DataError(f"{where}: expected finite numbers and positive l w h, found {' '.join(words)}")
-    return values
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

@@ -16,6 +16,7 @@ from lidarfw._lazy import LazyModule
 from lidarfw.components.datasets.drives import Array, Drive, DriveDataset, inverse, pose_of
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.io import read_points
+from lidarfw.nuscenes import CLASSES
 from lidarfw.types import Boxes, Camera, DataSpec, Frame, FrameMeta, Points, Poses, Spec, Targets, Tracks
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class NuScenesDataset(DriveDataset):
         root: str = "",
         split: str = "train",
         version: str = "v1.0-trainval",
-        classes: tuple[str, ...] = nuscenes.CLASSES,
+        classes: tuple[str, ...] = CLASSES,
         sweeps: int = 10,
         pose: bool = False,
     ) -> None:
