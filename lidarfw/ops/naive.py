@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lidarfw.ops.boxes import iou_bev
+from lidarfw.ops.pose import kabsch
 from lidarfw.ops.rulebook import Rulebook
 from lidarfw.types import Grid, Points, RangeImage, RangeView
 
@@ -95,10 +96,12 @@ def farthest_points(xyz: Tensor, count: int) -> Tensor:
     return torch.tensor(chosen)
 
 
-def score_poses(matrices: Tensor, source: Tensor, world: Tensor, threshold: float) -> Tensor:
-    """(H,) MSAC scores, one hypothesis after another."""
-    scores = []
-    for matrix in matrices:
+def best_pose(source: Tensor, world: Tensor, triples: Tensor, threshold: float) -> Tensor:
+    """(4, 4) best by MSAC score of the poses fitted to the triples (H, 3), one hypothesis after another."""
+    best, lowest = torch.eye(4), torch.inf
+    for triple in triples:
+        matrix = kabsch(source[triple], world[triple])
         apart = (source @ matrix[:3, :3].T + matrix[:3, 3] - world).square().sum(1)
-        scores.append(apart.clamp(max=threshold**2).sum())
-    return torch.stack(scores)
+        score = float(apart.clamp(max=threshold**2).sum())
+        best, lowest = (matrix, score) if score < lowest else (best, lowest)
+    return best

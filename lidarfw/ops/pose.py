@@ -7,7 +7,7 @@ from torch import Tensor
 
 from lidarfw.types import Poses, SceneCoords
 
-_RESIDUALS = 2**20  # residuals formed at once
+_RESIDUALS = 2**16  # residuals formed at once: they stay in the processor's cache
 
 
 def kabsch(source: Tensor, target: Tensor, weight: Tensor | None = None) -> Tensor:

@@ -60,15 +60,15 @@ def test_naive_suppression_keeps_the_same_boxes(kind: str) -> None:
     torch.testing.assert_close(ops.iou_bev(boxes[:50].double(), boxes[:50].double()), exact, rtol=0, atol=1e-6)
 
 
-def test_naive_pose_scores_find_the_pose_that_ours_finds() -> None:
+def test_naive_pose_search_finds_the_pose_that_ours_finds() -> None:
     source = torch.randn(100, 3, generator=torch.Generator().manual_seed(0)) * 10
-    good = torch.eye(4)
-    good[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
-    world = ops.transform(good, source)
-    scores = naive.score_poses(torch.stack([torch.eye(4), good]), source, world, 0.5)
-    assert scores[1] < 1e-3 < scores[0]
+    pose = torch.eye(4)
+    pose[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    world = ops.transform(pose, source)
+    triples = torch.randint(100, (20, 3), generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(naive.best_pose(source, world, triples, 0.5), pose, rtol=1e-3, atol=1e-3)
     pairs = SceneCoords(source, world, torch.ones(100), torch.zeros(100, dtype=torch.long))
-    torch.testing.assert_close(ops.ransac_pose(pairs).matrix[0], good, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(ops.ransac_pose(pairs).matrix[0], pose, rtol=1e-4, atol=1e-4)
 
 
 def test_floating_point_operations_are_counted_from_the_pairs(scan, monkeypatch) -> None:
