@@ -5,6 +5,7 @@ Every body is centred in x and y, stands on z = 0, looks along +x and fills its 
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -310,7 +311,16 @@ RIDERS = {"pedestrian": pedestrian, "cyclist": cyclist, "motorcyclist": motorcyc
 
 
 def make(kind: str, seed: tuple[int, ...], phase: float = 0.0) -> Mesh:
-    """The body of an object: the same for the same seed, apart from the phase of the gait."""
+    """The body of an object: the same for the same seed, apart from the phase of the gait, radians.
+
+    Gaits have 24 phases, so that bodies need not be made anew in every frame.
+    """
+    return _made(kind, seed, round(phase / (2 * np.pi) * 24) % 24)
+
+
+@functools.lru_cache(maxsize=4096)
+def _made(kind: str, seed: tuple[int, ...], step: int) -> Mesh:
+    phase = step * 2 * np.pi / 24
     rng = np.random.default_rng(seed)
     mesh = VEHICLES[kind](rng) if kind in VEHICLES else RIDERS[kind](rng, phase)
     return mesh.with_semantic(KINDS[kind].semantic)
