@@ -107,6 +107,11 @@ def test_past_scans_stand_in_the_current_frame(root):
     assert len(dataset(root, sweeps=3)[1].inputs["points"]) == 2 * len(IDS)  # the sequence starts
 
 
+def test_ten_scans_a_second_without_times(root):
+    (root / "sequences/08/times.txt").unlink()
+    assert [dataset(root).meta(i).time for i in range(4)] == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
 def test_splits(root):
     assert dataset(root, "all").named == []
     assert [d.name for d in dataset(root, "all").drives] == ["00", "08"]

@@ -51,6 +51,7 @@ _IDS = {
 }  # fmt: skip
 _FIRST_MOVING = 251
 TASKS = {"semantics": CLASSES, "moving": MOVING}
+_PERIOD = 0.1  # seconds between scans without times.txt
 _UNKNOWN = -2  # in the tables below: an id that the dataset does not have
 
 
@@ -131,7 +132,7 @@ class SemanticKittiDataset(DriveDataset):
         folder = self.folder / sequence
         scans = scans_in(folder / "velodyne")
         numbers = [int(scan.stem) for scan in scans]
-        times = rows_of(read_table(folder / "times.txt", 1), numbers, folder / "times.txt")[:, 0]
+        times = _times(folder / "times.txt", numbers)
         cameras = rows_of(read_poses(folder / "poses.txt"), numbers, folder / "poses.txt")
         extrinsics = _extrinsics(folder / "calib.txt")
         return Drive(sequence, scans, times, inverse(extrinsics) @ cameras @ extrinsics)
@@ -166,6 +167,14 @@ class SemanticKittiDataset(DriveDataset):
     @staticmethod
     def _label_path(scan: Path) -> Path:
         return scan.parent.parent / "labels" / f"{scan.stem}.label"
+
+
+def _times(path: Path, numbers: list[int]) -> Array:
+    """Seconds (N,) of the scans; ten a second where there is no times.txt, as in KITTI-Road."""
+    if not path.is_file():
+        return np.array([_PERIOD * number for number in numbers])
+    seconds: Array = rows_of(read_table(path, 1), numbers, path)[:, 0]
+    return seconds
 
 
 def _extrinsics(path: Path) -> Array:
