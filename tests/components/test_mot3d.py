@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
 from lidarfw.components.metrics.mot3d import Mot3D
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.mot import best_pairs, recall_thresholds, trajectory_figures
@@ -326,3 +329,27 @@ def test_a_process_without_frames_takes_part_in_the_exchange() -> None:
         metric.dist_sync_fn, metric.distributed_available_fn = gather, lambda: True
         assert metric.compute() == pytest.approx(figures(*noisy_sequence(0, 6)))
         assert len(gathered) == len(names)
+
+
+def test_real_labels_as_tracks(real_data: Callable[[str], Path]) -> None:
+    """Labels of a real drive, in the LiDAR frame, with its cameras: perfect, and lost where they are moved."""
+    dataset = KittiTrackingDataset(
+        root=str(real_data("kitti_tracking")), split="0000", poses="", classes=("Car", "Cyclist")
+    )
+    spec = Spec(Tracks, classes=("Car", "Cyclist"))
+    right, wrong = Mot3D(spec), Mot3D(spec)
+    for number in range(0, len(dataset), 4):
+        frame = dataset[number]
+        known = frame.targets.tracks
+        assert known is not None
+        aside = known.boxes.replace(center=known.boxes.center + torch.tensor([0, 0, 3.0]))
+        right.update(known, frame.targets, [frame.meta])
+        wrong.update(Tracks(aside, known.id), frame.targets, [frame.meta])
+    found = right.compute()
+    names = [name for name in ("car", "cyclist") if f"{name}_mota" in found]
+    assert names
+    for name in names:
+        assert [found[f"{name}_{key}"] for key in ("mota", "idf1", "hota", "fp", "fn")] == pytest.approx(
+            [1, 1, 1, 0, 0]
+        )
+    assert wrong.compute()["mean_mota"] <= 0
