@@ -190,11 +190,12 @@ def rigid(rows: Array, path: Path) -> Array:
     matrices = np.tile(np.eye(4), (len(rows), 1, 1))
     matrices[:, :3] = rows.reshape(-1, 3, 4)
     turn = matrices[:, :3, :3]
-    wrong = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > 1e-2
-    wrong |= np.linalg.det(turn) < 0
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(turn @ turn.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+        wrong = ~((apart < 1e-2) & (np.linalg.det(turn) > 0) & np.isfinite(rows).all(axis=1))  # NaN is wrong too
     if wrong.any():
         line = int(wrong.argmax())
-        raise DataError(f"{path}, line {line + 1}: expected a rotation (orthonormal), found {turn[line].tolist()}")
+        raise DataError(f"{path}, line {line + 1}: expected a rotation (orthonormal), found {rows[line].tolist()}")
     return matrices
 
 

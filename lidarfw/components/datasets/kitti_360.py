@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -262,8 +263,10 @@ def _times(path: Path, numbers: Sequence[int]) -> Array:
     if numbers and max(numbers) >= len(lines):
         raise DataError(f"{path}: has {len(lines)} lines, but there is a scan {max(numbers):010d}")
     try:
-        stamps = np.array([lines[number].strip() for number in numbers], dtype="datetime64[ns]")
-    except ValueError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # numpy only warns of a time zone
+            stamps = np.array([lines[number].strip() for number in numbers], dtype="datetime64[ns]")
+    except (ValueError, UserWarning) as error:
         raise DataError(f"{path}: expected a date and time per line: {error}") from error
     return stamps.astype(np.int64) / 1e9
 
@@ -271,4 +274,8 @@ def _times(path: Path, numbers: Sequence[int]) -> Array:
 def _read_numbered(path: Path) -> dict[int, Array]:
     """Poses (4, 4) by frame number, from lines of the number and 12 values."""
     table = read_table(path, 13)
+    wrong = (table[:, 0] < 0) | (table[:, 0] >= 1e10) | (table[:, 0] % 1 != 0)
+    if wrong.any():
+        line = int(wrong.argmax())
+        raise DataError(f"{path}, line {line + 1}: expected a frame number of ten digits first, found {table[line, 0]}")
     return dict(zip(table[:, 0].astype(int).tolist(), rigid(table[:, 1:], path), strict=True))
