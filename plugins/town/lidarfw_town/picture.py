@@ -37,7 +37,7 @@ def write_picture(path: str | Path, seed: int, lidar: Lidar, traversal: int = 0)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drive = Drive(seed, 600, lidar, traversal=traversal)
+    drive = Drive(seed, 300, lidar, traversal=traversal)
     frame = drive.frame(_STEP)
     figure = Figure((16, 13.4), dpi=100, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
@@ -72,7 +72,7 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
             linewidths=0,
         )
     )
-    axes.plot(*drive.traffic.ego[:, :2].T, color="#C2185B", linewidth=2, label="route of a minute")
+    axes.plot(*drive.traffic.ego[:, :2].T, color="#C2185B", linewidth=2, label="route of half a minute")
     axes.plot(*drive.traffic.ego[_STEP, :2], "o", color="#C2185B", markersize=7)
     movers = np.array([(*mover.at(_STEP)[:2], mover.kind == "pedestrian") for mover in drive.traffic.movers])
     for chosen, colour, name in ((movers[:, 2] == 0, "#0B3D91", "vehicles"), (movers[:, 2] == 1, "#D32F2F", "people")):

@@ -155,7 +155,7 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
 def _remission(hits: Hits, cosine: Floats, signal: Floats, rng: np.random.Generator) -> Floats:
     """Calibrated remission: mostly the reflectance, weaker at grazing incidence, 0 where the pulse was faint."""
     value = hits.reflectance * (0.86 + 0.24 * cosine) * rng.normal(1, 0.13, len(cosine))
-    faint = rng.random(len(cosine)) < 1 / (1 + (signal / 0.02) ** 1.5)
+    faint = rng.random(len(cosine)) < 1 / (1 + (signal / 0.035) ** 1.5)
     # levels of a hundredth, as the devices give them
     return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)
 

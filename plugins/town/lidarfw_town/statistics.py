@@ -87,7 +87,7 @@ def _cars(root: str) -> Array:
         seen = (boxes.occlusion <= 0) & (boxes.truncation <= 0.05)
         inside = points_in_boxes_mask(frame.inputs["points"].xyz, boxes.tensor).sum(0)
         table = np.concatenate([boxes.center.norm(dim=1)[:, None], inside[:, None], boxes.size], 1)
-        rows.append(table[seen].numpy())
+        rows.append(table[np.asarray(seen)])
     return np.concatenate(rows).astype(np.float64)
 
 

@@ -10,8 +10,10 @@ import pytest
 from lidarfw import kitti
 from lidarfw.components.datasets.kitti import KittiDataset
 from lidarfw.errors import ConfigError, DataError
+from PIL import Image
 from scipy.spatial import cKDTree
 
+from lidarfw_town import statistics
 from lidarfw_town.__main__ import main
 from lidarfw_town.bodies import KINDS, make
 from lidarfw_town.camera import Pinhole, kitti_camera
@@ -253,3 +255,38 @@ def test_bodies_fill_their_size_and_walk(kind: str) -> None:
     assert (make(kind, (1, 2)).triangles == body.triangles).all()
     if kind == "pedestrian":
         assert not np.allclose(make(kind, (1, 2), 1.5).triangles, body.triangles, atol=0.05)
+
+
+def test_statistics_of_two_folders_make_a_figure(
+    written: Job, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    job = Job("semantic_kitti", str(tmp_path / "scans"), seed=3, frames=2, sensor="small", picture_width=0)
+    generate(job, quiet=True)
+    folders = [f"--{which}-{kind}" for which in ("town", "real") for kind in ("objects", "sequences")]
+    values = [written.root, job.root] * 2
+    arguments = [word for pair in zip(folders, values) for word in pair]
+    assert statistics.main([*arguments, "--out", str(tmp_path / "figure.png")]) == 0
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
+    assert len(rows) == 6
+    assert all(ours == theirs.removesuffix(" |") for _, ours, theirs in rows)
+    assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_picture_shows_the_town(tmp_path: Path) -> None:
+    assert main(["--picture", "--out", str(tmp_path / "town.png"), "--sensor", "small"]) == 0
+    with Image.open(tmp_path / "town.png") as picture:
+        pixels = np.asarray(picture.convert("RGB"))
+    assert pixels.shape[1] == 1600
+    assert pixels.std() > 30
+
+
+def test_tracking_files_keep_ids_and_places(tmp_path: Path) -> None:
+    job = Job("kitti_tracking", str(tmp_path), seed=1, frames=3, sensor="small", picture_width=0)
+    generate(job, quiet=True)
+    rows = [line.split() for line in (tmp_path / "training/label_02/0000.txt").read_text().splitlines()]
+    oxts = np.loadtxt(tmp_path / "training/oxts/0000.txt")
+    ids = [{row[1] for row in rows if row[0] == str(frame) and row[2] != "DontCare"} for frame in range(3)]
+    assert oxts.shape == (3, 30)
+    assert all(len(row) == 17 for row in rows)
+    assert ids[0] & ids[1] & ids[2]
+    assert (tmp_path / "training/calib/0000.txt").read_text().count("\n") == 7
