@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial import cKDTree
 
 from lidarfw.components.datasets.semantic_kitti import CLASSES, SemanticKittiDataset
@@ -110,6 +111,20 @@ def test_past_scans_stand_in_the_current_frame(root):
 def test_ten_scans_a_second_without_times(root):
     (root / "sequences/08/times.txt").unlink()
     assert [dataset(root).meta(i).time for i in range(4)] == pytest.approx([0, 0.1, 0.2, 0.3])
+
+
+def test_camera_where_the_picture_is_there(root):
+    assert dataset(root)[0].meta.cameras == {}
+    folder = root / "sequences/08"
+    (folder / "image_2").mkdir()
+    Image.new("RGB", (1226, 370)).save(folder / "image_2/000001.png")
+    (folder / "calib.txt").write_text(f"P2: 700 0 600 70 0 700 180 0 0 0 1 0\n{TR}\n")
+    meta = dataset(root)[1].meta
+    assert meta.images == {"image": str(folder / "image_2/000001.png")}
+    uv, depth, _ = meta.cameras["image"].project(torch.tensor([[10.3, 2.0, -0.7]]))
+    # in camera 0: 1.9 m to the left, 0.5 m down, 10 m ahead; the picture's camera is 0.1 m to the left of it
+    assert uv[0].tolist() == pytest.approx([600 - 700 * 0.18, 180 + 700 * 0.05], abs=1e-2)
+    assert depth[0] == pytest.approx(10, abs=1e-4)
 
 
 def test_splits(root):

@@ -27,8 +27,9 @@ from lidarfw.components.datasets.drives import (
     rows_of,
     scans_in,
 )
+from lidarfw.components.datasets.kitti import picture_size
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.types import DataSpec, Frame, PointLabels, Points, Poses, Spec, Targets
+from lidarfw.types import Camera, DataSpec, Frame, FrameMeta, PointLabels, Points, Poses, Spec, Targets
 
 if TYPE_CHECKING:
     import torch
@@ -148,13 +149,29 @@ class SemanticKittiDataset(DriveDataset):
                     f"missing, the first is {missing[0]}.label.\n  fix: download the labels, or correct the split"
                 )
 
+    def meta(self, index: int) -> FrameMeta:
+        """Id, time and files of a frame, without its camera."""
+        meta = super().meta(index)
+        picture = self.folder / meta.sequence / "image_2" / f"{Path(meta.path).stem}.png"
+        meta.images = {kitti.IMAGE: str(picture)} if picture.is_file() else {}
+        return meta
+
+    def _cameras(self, meta: FrameMeta) -> dict[str, Camera]:
+        """The left colour camera as `image`, and camera 0 as `rectified`, where the picture is there."""
+        if not meta.images:
+            return {}
+        lens, extrinsics = _calibration(self.folder / meta.sequence / "calib.txt", "P2", "Tr")
+        rig = kitti.Calibration(lens[:3], np.eye(3), extrinsics[:3])
+        return rig.cameras(*picture_size(meta.images[kitti.IMAGE]))
+
     def __getitem__(self, index: int) -> Frame:
-        drive, place = self.find(index)
+        meta, (drive, place) = self.meta(index), self.find(index)
+        meta.cameras = self._cameras(meta)
         scans, pose = self.scans(drive, place), pose_of(drive, place)
         points = self.merged(scans, drive, place)
         inputs: dict[str, Points | Poses | None] = {"points": points} | ({"pose": pose} if self.pose else {})
         labels = self._labels(drive, place, scans) if self.labelled else None
-        return Frame(inputs, Targets(points=labels, poses=pose), self.meta(index))
+        return Frame(inputs, Targets(points=labels, poses=pose), meta)
 
     def _labels(self, drive: Drive, place: int, scans: list[Points]) -> PointLabels:
         """Class and instance of every point of the frame's scans."""
@@ -177,21 +194,28 @@ def _times(path: Path, numbers: list[int]) -> Array:
     return seconds
 
 
-def _extrinsics(path: Path) -> Array:
-    """(4, 4) LiDAR -> camera 0, the row `Tr` of a calibration file."""
+def _calibration(path: Path, *keys: str) -> list[Array]:
+    """(4, 4) matrices of a calibration file: Tr is LiDAR -> camera 0, P2 camera 0 -> the left colour picture."""
     rows = dict(row.split(":", 1) for row in kitti.read_text(path).splitlines() if ":" in row)
-    if "Tr" not in rows:
-        raise DataError(
-            f"{path}: no key Tr (LiDAR to camera); it has {', '.join(rows) or 'none'}.\n"
-            f"  fix: take calib.txt of the SemanticKITTI download, those of KITTI odometry's pictures lack Tr"
-        )
-    words = rows["Tr"].split()
-    try:
-        values = np.array(words, dtype=np.float64).reshape(1, 12)
-    except ValueError:
-        raise DataError(f"{path}: Tr: expected 12 numbers, found {' '.join(words)[:80]!r}") from None
-    matrix: Array = rigid(values, path)[0]
-    return matrix
+    matrices = []
+    for key in keys:
+        if key not in rows:
+            raise DataError(
+                f"{path}: no key {key}; it has {', '.join(rows) or 'none'}.\n"
+                f"  fix: take calib.txt of the SemanticKITTI download, those of KITTI odometry's pictures lack Tr"
+            )
+        try:
+            values = np.array(rows[key].split(), dtype=np.float64).reshape(3, 4)
+        except ValueError:
+            raise DataError(f"{path}: {key}: expected 12 numbers, found {rows[key].strip()[:80]!r}") from None
+        matrices.append(np.concatenate([values, [[0.0, 0.0, 0.0, 1.0]]]))
+    return matrices
+
+
+def _extrinsics(path: Path) -> Array:
+    """(4, 4) LiDAR -> camera 0."""
+    (matrix,) = _calibration(path, "Tr")
+    return np.asarray(rigid(matrix[:3].reshape(1, 12), path)[0])
 
 
 def _read_labels(path: Path, count: int, task: str) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
