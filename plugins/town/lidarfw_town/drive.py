@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -211,8 +211,3 @@ def _labels(semantic: np.ndarray, instance: np.ndarray, objects: list[Object]) -
         if thing.moving:
             whole[instance == thing.id] = KINDS[thing.kind].moving
     return np.asarray(whole | (instance.astype(np.uint32) << 16))
-
-
-def without_noise(lidar: Lidar) -> Lidar:
-    """The same LiDAR with exact ranges, for tests and studies."""
-    return replace(lidar, noise=0.0)

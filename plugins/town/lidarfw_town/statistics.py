@@ -99,7 +99,10 @@ def draw(path: str | Path, town: Statistics, real: Statistics) -> None:
     figure = Figure((13, 7.5), dpi=100, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3)
-    _histogram(axes[0, 0], town.counts / 1000, real.counts / 1000, np.linspace(60, 135, 31), "points a scan (1000)")
+    most = float(max(town.counts.max(), real.counts.max())) / 1000
+    _histogram(
+        axes[0, 0], town.counts / 1000, real.counts / 1000, np.linspace(0, most * 1.05, 61), "points a scan (1000)"
+    )
     _histogram(axes[0, 1], town.ranges, real.ranges, np.linspace(0, 85, 86), "range (m)")
     _histogram(axes[0, 2], town.remission, real.remission, np.linspace(0, 1, 51), "remission")
     _against_distance(axes[1, 0], town, real)

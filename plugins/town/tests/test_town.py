@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lidarfw import kitti
 from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
+from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.errors import ConfigError, DataError
 from PIL import Image
 from scipy.spatial import cKDTree
@@ -280,13 +283,41 @@ def test_the_picture_shows_the_town(tmp_path: Path) -> None:
     assert pixels.std() > 30
 
 
-def test_tracking_files_keep_ids_and_places(tmp_path: Path) -> None:
-    job = Job("kitti_tracking", str(tmp_path), seed=1, frames=3, sensor="small", picture_width=0)
+@pytest.fixture(scope="module")
+def tracked(tmp_path_factory: pytest.TempPathFactory) -> Job:
+    root = str(tmp_path_factory.mktemp("tracking"))
+    job = Job("kitti_tracking", root, seed=1, frames=3, sensor="small", picture_width=0, stride=5)
     generate(job, quiet=True)
-    rows = [line.split() for line in (tmp_path / "training/label_02/0000.txt").read_text().splitlines()]
-    oxts = np.loadtxt(tmp_path / "training/oxts/0000.txt")
+    return job
+
+
+def test_tracking_files_keep_ids_and_places(tracked: Job) -> None:
+    folder = Path(tracked.root) / "training"
+    rows = [line.split() for line in (folder / "label_02/0000.txt").read_text().splitlines()]
+    oxts = np.loadtxt(folder / "oxts/0000.txt")
     ids = [{row[1] for row in rows if row[0] == str(frame) and row[2] != "DontCare"} for frame in range(3)]
     assert oxts.shape == (3, 30)
     assert all(len(row) == 17 for row in rows)
     assert ids[0] & ids[1] & ids[2]
-    assert (tmp_path / "training/calib/0000.txt").read_text().count("\n") == 7
+    assert (folder / "calib/0000.txt").read_text().count("\n") == 7
+
+
+def test_the_core_loader_of_tracking_reads_the_places(tracked: Job) -> None:
+    dataset = KittiTrackingDataset(root=tracked.root, split="all")
+    dataset.prepare()
+    loaded = np.stack([dataset[number].targets.poses.matrix[0].double().numpy() for number in range(3)])
+    steps = 10 + 5 * np.arange(3.0)
+    wanted = drive_of(replace(tracked, root=""), 0).poses(steps)
+    relative, expected = (np.linalg.inv(poses[0]) @ poses for poses in (loaded, wanted))
+    assert np.linalg.norm(expected[2, :3, 3]) > 1
+    assert relative == pytest.approx(expected, abs=0.01)
+
+
+def test_the_core_loader_of_semantic_kitti_reads_scans_and_labels(tmp_path: Path) -> None:
+    job = Job("semantic_kitti", str(tmp_path), seed=1, frames=2, sensor="small", picture_width=0)
+    generate(job, quiet=True)
+    dataset = SemanticKittiDataset(root=str(tmp_path), split="all", task="moving")
+    dataset.prepare()
+    frame = dataset[1]
+    assert len(frame.targets.points.label) == len(frame.inputs["points"])
+    assert {0, 1} <= set(frame.targets.points.label.tolist())
