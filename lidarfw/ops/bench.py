@@ -471,6 +471,7 @@ def draw(report: Report, path: Path) -> None:
         axes.bar_label(bars, fmt="%.1f", padding=2, fontsize=7)
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set_xscale("log")
+    axes.set_ylim(0.3, len(timings) + 0.7)
     axes.set_yticks([len(timings) - i for i in range(len(timings))], [t.case for t in timings], fontsize=8)
     axes.set_xlabel("time of the other / time of lidarfw.ops (right of 1: lidarfw is faster)")
     axes.set_title(f"{report.machine['processor']}, {report.machine['threads']} thread(s)", fontsize=9)
