@@ -43,7 +43,7 @@ def range_project(points: Points, view: RangeView) -> RangeImage:
 
 
 def residual_images(current: RangeImage, past: Sequence[Points]) -> Tensor:
-    """(B, len(past), H, W) relative change of range |r - r_past| / r; 0 where a pixel has no point in one of both.
+    """(B, len(past), H, W) relative change of range `abs(r - r_past) / r`; 0 where a pixel has no point in one of both.
 
     Chen et al., "Moving Object Segmentation in 3D LiDAR Data" (RA-L 2021), equation 1. The past scans stand in
     the current sensor frame already.
