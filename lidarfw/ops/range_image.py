@@ -10,7 +10,7 @@ from torch.nn import functional as F
 
 from lidarfw.types import Points, RangeImage, RangeView
 
-_CHUNK = 16384  # points per chunk of range_knn: its vectors stay in the processor's cache
+_CHUNK = 2**16  # points at a time: enough for several threads, few enough for the cache
 
 
 def _project(points: Points, view: RangeView) -> tuple[Tensor, Tensor]:
