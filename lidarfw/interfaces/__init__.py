@@ -8,21 +8,23 @@ from lidarfw._lazy import lazy_attributes
 from lidarfw.interfaces.data import Dataset, Transform
 
 if TYPE_CHECKING:
+    from lidarfw.interfaces.metric import Metric
     from lidarfw.interfaces.model import (
         Backbone,
         Component,
         Filter,
         Head,
         Loss,
-        Metric,
         Neck,
         PostProcessor,
         Retriever,
         Tracker,
     )
 
-_MODEL = ["Backbone", "Component", "Filter", "Head", "Loss", "Metric", "Neck", "PostProcessor", "Retriever", "Tracker"]
-__getattr__ = lazy_attributes(__name__, dict.fromkeys(_MODEL, "lidarfw.interfaces.model"))
+_MODEL = ["Backbone", "Component", "Filter", "Head", "Loss", "Neck", "PostProcessor", "Retriever", "Tracker"]
+__getattr__ = lazy_attributes(
+    __name__, dict.fromkeys(_MODEL, "lidarfw.interfaces.model") | {"Metric": "lidarfw.interfaces.metric"}
+)
 
 SLOTS: dict[str, str] = {
     "dataset": "Dataset",

@@ -1,4 +1,4 @@
-"""The eight interfaces of the model side, and Metric.
+"""The eight interfaces of the model side.
 
 The parameters of `forward` (of `step` for Filter and Tracker, `update` for Metric) say what a component
 needs; `__init__` gets their Specs under the same names, positionally, and its keyword-only arguments are the
@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any, ClassVar, TypeAlias
 
-import torchmetrics
 from torch import Tensor, nn
 
 from lidarfw.types import Descriptors, FrameResult, Matches, Poses, Spec
@@ -103,13 +102,3 @@ class Retriever(Component):
     @abstractmethod
     def query(self, index: Any, descriptors: Descriptors, k: int) -> Matches:
         """The k nearest map entries of each descriptor."""
-
-
-class Metric(torchmetrics.Metric):
-    """Streaming figures: `update` takes predictions, targets and meta by the wiring rules; `compute` a dict of floats.
-
-    `monitor` names the entry of `compute` that stands for the metric as a whole; higher is better.
-    """
-
-    monitor: ClassVar[str]
-    example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
