@@ -23,7 +23,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
-from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf, open_dict
@@ -318,15 +318,3 @@ def _plugin_modules() -> list[str]:
 
 def _allowed_bases() -> tuple[type, ...]:
     return tuple(getattr(importlib.import_module(m), name) for m, names in _ALLOWED_BASES.items() for name in names)
-
-
-__all__ = [
-    "ConfigCompositionException",
-    "check_target",
-    "compose",
-    "explain",
-    "instantiate",
-    "node_class",
-    "register",
-    "to_plain",
-]

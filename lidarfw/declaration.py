@@ -22,7 +22,6 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from lidarfw import registry
 from lidarfw.errors import RegistryError
-from lidarfw.interfaces import SLOTS
 from lidarfw.types import VOCABULARY, FrameMeta, FrameResult, Stride, Sweeps, Tap, Targets
 
 REQUIRED: Any = inspect.Parameter.empty
@@ -106,9 +105,9 @@ def from_source(entry: registry.Entry) -> Declaration | None:
 
 def read(slot: str, name: str) -> Declaration:
     """The declaration of a registered component or of "package.module:Class"."""
-    for layer in reversed(registry._in_use):
-        if name in layer.get(slot, {}):
-            return _declare(registry.find(slot, name), _ImportedClass(layer[slot][name]))
+    local = registry.given(slot, name)
+    if local is not None:
+        return _declare(registry.find(slot, name), _ImportedClass(local))
     return _read(registry.find(slot, name))
 
 
@@ -402,16 +401,3 @@ def all_declarations(slot: str) -> list[Declaration]:
         except RegistryError:
             continue
     return found
-
-
-__all__ = [
-    "REQUIRED",
-    "SLOTS",
-    "Declaration",
-    "Option",
-    "Parameter",
-    "all_declarations",
-    "kind_name",
-    "of_class",
-    "read",
-]

@@ -105,11 +105,16 @@ def find(slot: str, name: str) -> Entry:
     return found[0]
 
 
+def given(slot: str, name: str) -> Any:
+    """The class that `use` gave for a name, innermost first, or None."""
+    return next((layer[slot][name] for layer in reversed(_in_use) if name in layer.get(slot, {})), None)
+
+
 def load(slot: str, name: str) -> Any:
     """The class of a component, imported now."""
-    for layer in reversed(_in_use):
-        if name in layer.get(slot, {}):
-            return layer[slot][name]
+    local = given(slot, name)
+    if local is not None:
+        return local
     entry = find(slot, name)
     module, _, attribute = entry.value.partition(":")
     try:

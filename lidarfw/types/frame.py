@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from lidarfw._lazy import LazyModule
-from lidarfw.types.features import BEV, Image, Points, RangeImage
+from lidarfw.types.features import BEV, Image, RangeImage
 from lidarfw.types.geometry import Camera
 from lidarfw.types.predictions import Boxes, Descriptors, PointLabels, Poses, Tracks
 from lidarfw.types.record import Record, Rows
@@ -156,6 +156,3 @@ def collate(frames: Sequence[Frame]) -> Batch:
         values = [getattr(f.targets, entry.name) for f in frames]
         targets[entry.name] = None if any(v is None for v in values) else _collate_records(values)
     return Batch(inputs, Targets(**targets), [f.meta for f in frames])
-
-
-__all__ = ["Batch", "Frame", "FrameMeta", "FrameResult", "Points", "Targets", "collate", "take"]
