@@ -1,0 +1,1 @@
+"""Postprocessors of the plugin."""
