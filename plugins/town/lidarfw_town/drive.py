@@ -53,7 +53,8 @@ class Drive:
 
     With `compensated`, the points of a scan are where they were at its middle moment, as if the vehicle had stood
     still (as in KITTI odometry); without, they are where the turning sensor saw them. Boxes fit the points either way:
-    an object is scanned at the moment when the beams pass it, and its box is that of this moment.
+    an object is scanned at the moment when the beams pass it, and its box is that of this moment. `circuit`: every
+    traversal goes round the same loop. `world` is that of the seed, where it stands already.
     """
 
     def __init__(
@@ -65,11 +66,13 @@ class Drive:
         traversal: int = 0,
         compensated: bool = False,
         weather: str = "clear",
+        circuit: bool = False,
+        world: World | None = None,
     ) -> None:
         self.seed, self.traversal, self.lidar, self.compensated = seed, traversal, lidar, compensated
         self._weather = WEATHER[weather]
-        self.world = World(seed)
-        self.traffic = Traffic(self.world, traversal, steps)
+        self.world = world or World(seed)
+        self.traffic = Traffic(self.world, traversal, steps, circuit=circuit)
         self._directions, self._shares = lidar.rays()
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,7 @@ LANE = 3.5  # metres
 PARKING_WIDTH = 2.3
 PAVEMENT_WIDTH = 2.4
 TRIM = 11.0  # metres from a node at which its junction begins
+CIRCUIT = 620.0  # metres of the way that is driven again and again
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +141,31 @@ def random_route(network: Network, first: Street, forward: bool, length: float, 
         seen.add(frozenset((street.start, street.end)))
         done += float(arc_length(street.line)[-1])
     return route
+
+
+def circuit(network: Network, reverse: bool, length: float) -> list[int]:
+    """Node numbers of at least `length` metres round and round the loop of streets that is nearest to CIRCUIT long."""
+    metres = {}
+    for street in network.streets:
+        if not street.highway:
+            metres[street.start, street.end] = metres[street.end, street.start] = float(arc_length(street.line)[-1])
+    loops = [loop for node in range(len(network.nodes)) for loop in _loops([node], metres)]
+    total = [sum(metres[pair] for pair in itertools.pairwise([*loop, loop[0]])) for loop in loops]
+    best = min(range(len(loops)), key=lambda n: (abs(total[n] - CIRCUIT), loops[n]))
+    loop = loops[best] if not reverse else [loops[best][1], loops[best][0], *loops[best][:1:-1]]
+    rounds = int(length / total[best]) + 2
+    return [*loop * rounds, loop[0]]
+
+
+def _loops(path: list[int], metres: Mapping[tuple[int, int], float]) -> Iterator[list[int]]:
+    """Every loop without crossings that starts with `path`, from its lowest node on, in both directions."""
+    for a, b in metres:
+        if a != path[-1] or b < path[0] or len(path) > 12:
+            continue
+        if b == path[0] and len(path) > 2:
+            yield path
+        elif b not in path:
+            yield from _loops([*path, b], metres)
 
 
 def lane_path(network: Network, route: Sequence[int], side: float = 0.0, step: float = 0.5) -> tuple[Array, Array]:

@@ -18,6 +18,7 @@ from lidarfw_town.streets import (
     PARKING_WIDTH,
     PAVEMENT_WIDTH,
     arc_length,
+    circuit,
     headings,
     lane_path,
     offset,
@@ -73,11 +74,12 @@ class Traffic:
     """One drive through a world: the ego vehicle, the other vehicles, people, and the parked ones.
 
     `ego` (T, 4) is x, y, heading, speed, every PERIOD seconds; `movers` and `parked` are the others. The traversal
-    number draws the parked vehicles anew, of which about a third keep their place, and another route.
+    number draws the parked vehicles anew, of which about a third keep their place, and another route; with `circuit`
+    the ego vehicle drives the same circuit every time, the other way round where the number is odd.
     """
 
-    def __init__(self, world: World, traversal: int, steps: int) -> None:
-        self._world, self._traversal = world, traversal
+    def __init__(self, world: World, traversal: int, steps: int, *, circuit: bool = False) -> None:
+        self._world, self._traversal, self._circuit = world, traversal, circuit
         self._rng = np.random.default_rng((world.seed, 1, traversal))
         self.parked = self._park(traversal)
         vehicles = self._drive(steps)
@@ -110,7 +112,10 @@ class Traffic:
             street = network.streets[int(rng.integers(len(network.streets)))]
             need = steps * PERIOD * KINDS[kind].speed + 260
             route = random_route(network, street, bool(rng.random() < 0.5), need, rng)
-            path, limit = lane_path(network, route, 1.45 if kind == "cyclist" else float(rng.normal(0, 0.08)))
+            side = 1.45 if kind == "cyclist" else float(rng.normal(0, 0.08))
+            if number == 0 and self._circuit:
+                route, side = circuit(network, self._traversal % 2 == 1, need), float(rng.uniform(-0.4, 0.4))
+            path, limit = lane_path(network, route, side)
             paths.append(path)
             limits.append(_speed_plan(path, np.minimum(limit * rng.uniform(0.8, 1.05), _fastest(kind, street.highway))))
             lengths.append(float(np.ptp(make(kind, self._seed(number)).triangles[..., 0])))
