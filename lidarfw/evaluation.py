@@ -1,4 +1,4 @@
-"""The config of an evaluation: that of the checkpoint, with overrides for everything but the model."""
+"""The config of an evaluation: that of the checkpoint, with overrides for everything but what it has learned."""
 
 from __future__ import annotations
 
@@ -12,12 +12,18 @@ from omegaconf import DictConfig, OmegaConf
 from lidarfw.config import compose
 from lidarfw.errors import ConfigError
 
-MODEL_KEYS = ("backbone", "neck", "head", "loss", "postprocessor", "filter", "tracker", "retriever", "balance")
+LEARNED_KEYS = ("backbone", "neck", "head", "loss", "balance")
+BROUGHT_KEYS = ("postprocessor", "metric")
+MODEL_KEYS = (*LEARNED_KEYS, "postprocessor", "filter", "tracker", "retriever")
 TRAINING_KEYS = ("optimizer", "scheduler", "init", "resume")  # of no use in an evaluation
 
 
 def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
-    """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set."""
+    """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set.
+
+    What comes after the heads may change too (`filter=NAME`, `postprocessor.nms.iou=0.5`), as far as the weights of
+    the checkpoint still fit.
+    """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
     except HydraException as error:
@@ -29,7 +35,7 @@ def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> Di
     progress = {name: node for name, node in (stored.get("callbacks") or {}).items() if name == "progress"}
     config = OmegaConf.create({**stored, "callbacks": progress, "logger": None, "resume": None, "init": None})
     for override in groups:
-        config[override.key_or_group] = composed[override.key_or_group]
+        config[override.key_or_group] = composed.get(override.key_or_group)
     for override in parsed:
         if override not in groups:
             _set(config, override)
@@ -44,10 +50,11 @@ def _selects(override: Any, stored: Mapping[str, Any]) -> bool:
 
 def _refuse(key: str, line: str) -> None:
     root = key.partition(".")[0].partition("@")[0]
-    if root in MODEL_KEYS:
+    if root in LEARNED_KEYS:
         raise ConfigError(
             f"{line}: {root} is part of the model, and the model comes from the checkpoint with its weights.\n"
-            "  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed\n"
+            "  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed, and what comes after "
+            "the heads: postprocessor, filter, tracker, retriever\n"
             f"  fix: train with {line}"
         )
     if root in TRAINING_KEYS:
@@ -58,7 +65,9 @@ def _set(config: DictConfig, override: Any) -> None:
     key = override.key_or_group
     parent, _, name = key.rpartition(".")
     there = OmegaConf.select(config, parent) if parent else config
-    adds = override.is_add() or override.is_force_add()
+    # what heads bring along stands in a checkpoint without its options: `plan` knows them
+    brought = key.partition(".")[0] in BROUGHT_KEYS and isinstance(there, DictConfig) and "type" in there
+    adds = override.is_add() or override.is_force_add() or brought
     if not isinstance(there, DictConfig) or (name not in there and not adds):
         known = ", ".join(str(k) for k in (there if isinstance(there, DictConfig) else config))
         raise ConfigError(f"{override.input_line}: the config of the checkpoint has no {key!r}.\n  there is: {known}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
@@ -163,11 +163,11 @@ class PerceptionModel(nn.Module):
 
     # metrics
 
-    def update_metrics(self, results: list[FrameResult]) -> None:
-        """Count finished frames in."""
+    def update_metrics(self, results: list[FrameResult], metrics: Mapping[str, Any] | None = None) -> None:
+        """Count finished frames in; `metrics` are others of the same names, where not the model's own."""
         for result in results:
             for step in self.plan.of("metric"):
-                self.component(step).update(**self._from_result(step, result))
+                (metrics or self._metrics)[step.name].update(**self._from_result(step, result))
 
     def compute_metrics(self) -> dict[str, float]:
         """All figures, as "metric/key"."""

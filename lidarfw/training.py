@@ -33,6 +33,7 @@ from lidarfw.types import Batch, DataSpec, FrameResult
 
 if TYPE_CHECKING:
     from lidarfw.model import PerceptionModel
+    from lidarfw.resampling import FrameRecord
 
 log = logging.getLogger(__name__)
 _say = rank_zero_only(log.info)
@@ -91,6 +92,7 @@ class PerceptionModule(pl.LightningModule):
         self.seed = seed
         self.sample_ids: list[str] = []  # of the batch at hand, for messages
         self.figures: dict[str, float] = {}  # of the last validation
+        self.record: FrameRecord | None = None  # of an evaluation that is asked for figures of single frames
         self._stream: Any = None
 
     @property
@@ -165,7 +167,12 @@ class PerceptionModule(pl.LightningModule):
         self.sample_ids = [meta.id for meta in batch.meta]
         results = self._finished(self.model.decode(self.model(batch), batch))
         if not self._idle:
-            self.model.update_metrics(results)
+            self._count(results)
+
+    def _count(self, results: list[FrameResult]) -> None:
+        self.model.update_metrics(results)
+        if self.record is not None:
+            self.record.add(results)
 
     @property
     def _idle(self) -> bool:
@@ -191,7 +198,7 @@ class PerceptionModule(pl.LightningModule):
 
     def _log_metrics(self, stage: str) -> None:
         if self._stream is not None and not self._idle:
-            self.model.update_metrics(self._stream.flush())
+            self._count(self._stream.flush())
         figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
         for name, value in figures.items():
             self.log(name, value, prog_bar=name == self.monitor, sync_dist=True)
@@ -434,12 +441,12 @@ def _logger(node: dict[str, Any], folder: Path) -> Any:
 # --- evaluation -----------------------------------------------------------------------------------------------------
 
 
-def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float]:
+def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecord | None = None) -> dict[str, float]:
     """Figures ("metric/key") of a checkpoint on the test split of its config.
 
     The model comes from the checkpoint; dataset, transforms, metric, loader, splits and trainer from its config too,
-    changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`).
-    Raises ConfigError for an override of the model, CheckpointError where the data is not what the model learned.
+    changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`). `record`
+    is filled with what every frame adds to the metrics; it needs an evaluation in one process. Raises ConfigError for an override of the model, CheckpointError where the data is not what the model learned.
     """
     from lidarfw.assembly import build, plan
 
@@ -453,8 +460,13 @@ def evaluate(path: str | Path, overrides: Sequence[str] = ()) -> dict[str, float
     model = build(wired)
     checkpoint.restore(model, content, path)
     module = _module(model, to_plain(config), about)
+    if record is not None:
+        record.start(model)
+        module.record = record
     with Termination() as stop:
         trainer = make_trainer(config, Path(path).parent, [stop])
+        if record is not None and trainer.world_size > 1:
+            raise ConfigError("figures of single frames need an evaluation in one process.\n  fix: trainer.devices=1")
         data = DataModule.from_config(config, streams=bool(model.filters))
         trainer.test(module, datamodule=data, verbose=False)
     return {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()}

@@ -10,8 +10,11 @@ import torchmetrics
 class Metric(torchmetrics.Metric):
     """Streaming figures: `update` takes predictions, targets and meta by the wiring rules; `compute` a dict of floats.
 
-    `monitor` names the entry of `compute` that stands for the metric as a whole; higher is better.
+    `monitor` names the entry of `compute` that stands for the metric as a whole; higher is better. States are sums or
+    lists of rows (`dist_reduce_fx` "sum" or "cat"), so that those of several processes, or of some frames only
+    (`lidarfw eval --frames`), can be put together.
     """
 
+    full_state_update = False
     monitor: ClassVar[str]
     example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
