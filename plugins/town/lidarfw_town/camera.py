@@ -1,135 +1,98 @@
-"""A pinhole camera: pictures of the town in colour, shaded by sun and sky."""
+"""The cameras of the vehicle: KITTI's pinhole, and KITTI-360's rig with two fisheyes.
+
+The cameras are lidarfw's `Camera`: `from_sensor` takes the frame of the LiDAR to that of the camera, so a camera says
+by itself where it stands. A picture of a frame (see `render.py`):
+
+    camera = fisheye_cameras(700)["image_02"]        # or kitti_camera(1242), perspective_cameras(1408)["image_00"]
+    shot = photograph(drive, drive.frame(20), camera)
+    shot.image      # (H, W, 3) uint8 RGB
+    shot.depth      # (H, W) float32 metres as in Camera.project: z of a pinhole, the distance else; 0 where no surface
+    shot.semantic   # (H, W) uint16 SemanticKITTI classes, movable objects by their standing class; 0 for the sky
+    shot.instance   # (H, W) int32 track ids, 0 for all else
+
+The lenses have the form and the size of KITTI-360's, with numbers of their own; the file formats are the layouts'
+business: a MEI camera's `intrinsics` are gamma1, gamma2, u0, v0 and its `distortion` xi, k1, k2, p1, p2.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import math
 
 import numpy as np
 import numpy.typing as npt
+from lidarfw.types import Camera
 
 from lidarfw_town.mesh import Array
-from lidarfw_town.sensors import Floats, Hits, Scene, first_hits
+from lidarfw_town.sensors import Floats
 
-KITTI_SIZE = (1242, 375)
-_KITTI_LENS = (721.5377, 721.5377, 609.5593, 172.854)  # fx, fy, cx, cy of the left colour camera
-# camera 0 stands 0.27 m ahead of the LiDAR and 0.08 m below it; camera 2 is 6 cm to the left of camera 0
-LIDAR_TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])
-BASELINE = 0.06
+LIDAR_TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27]])  # to KITTI's camera 0
+BASELINE = 0.06  # metres from camera 0 to camera 2, to the left
+LENS_EDGE = math.radians(95)  # from the axis of a fisheye: beyond, its picture is black
 
-
-@dataclass(frozen=True)
-class Pinhole:
-    """A camera without distortion: size in pixels, and fx, fy, cx, cy."""
-
-    width: int
-    height: int
-    lens: tuple[float, float, float, float]
-
-    @property
-    def projection(self) -> Array:
-        """(3, 4): rectified camera 0 -> pixels, KITTI's P2."""
-        fx, fy, cx, cy = self.lens
-        return np.array([[fx, 0, cx, fx * BASELINE], [0, fy, cy, 0], [0, 0, 1, 0]])
-
-    def rays(self) -> Floats:
-        """Directions (height, width, 3) of the pixel centres in the LiDAR's axes, unit length."""
-        fx, fy, cx, cy = self.lens
-        u, v = np.meshgrid((np.arange(self.width) - cx) / fx, (np.arange(self.height) - cy) / fy)
-        direction = np.stack([np.ones_like(u), -u, -v], -1)
-        return np.asarray(direction / np.linalg.norm(direction, axis=-1, keepdims=True), np.float32)
-
-    @property
-    def place(self) -> Array:
-        """Where the camera stands in the frame of the LiDAR, metres."""
-        return np.array([0.27, BASELINE, -0.08])
+_KITTI = Camera("pinhole", 1242, 375, (721.5377, 721.5377, 609.5593, 172.854))
+_PERSPECTIVE = Camera("pinhole", 1408, 376, (552.0, 552.0, 682.0, 238.0))
+_LEFT = Camera("mei", 1400, 1400, (1336.0, 1335.5, 716.0, 706.0), (2.21, 0.016, 1.66, 4e-4, 4e-4))
+_RIGHT = Camera("mei", 1400, 1400, (1485.0, 1484.5, 699.0, 698.0), (2.55, 0.05, 4.5, 1.3e-3, -7e-4))
 
 
-def kitti_camera(width: int = KITTI_SIZE[0]) -> Pinhole:
-    """KITTI's left colour camera, its picture scaled to a width in pixels."""
-    scale = width / KITTI_SIZE[0]
-    fx, fy, cx, cy = _KITTI_LENS
-    # whole numbers are pixel centres: the corner of the picture is at -0.5
-    lens = (fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5)
-    return Pinhole(width, round(KITTI_SIZE[1] * scale), lens)
+def kitti_camera(width: int = _KITTI.width) -> Camera:
+    """KITTI's left colour camera, camera 2, its picture scaled to a width in pixels."""
+    right, down, ahead = LIDAR_TO_CAMERA[:, :3]
+    return _mounted(_scaled(_KITTI, width), right, down, ahead, (0.27, BASELINE, -0.08))
 
 
-@dataclass(frozen=True)
-class Light:
-    """Sun and camera of a drive: direction to the sun, exposure, warmth of the light."""
-
-    sun: tuple[float, float, float]
-    exposure: float
-    warmth: float
+def kitti_projection(camera: Camera) -> Array:
+    """(3, 4): rectified camera 0 -> pixels of camera 2, KITTI's P2."""
+    fx, fy, cx, cy = camera.intrinsics
+    return np.array([[fx, 0, cx, fx * BASELINE], [0, fy, cy, 0], [0, 0, 1, 0]])
 
 
-def light_of(seed: int, traversal: int) -> Light:
-    """The light of a traversal: another hour and another exposure each time."""
-    rng = np.random.default_rng((seed, 6, traversal))
-    height, azimuth = np.radians(rng.uniform(22, 60)), rng.uniform(0, 2 * np.pi)
-    sun = (np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height))
-    return Light(
-        (float(sun[0]), float(sun[1]), float(sun[2])), float(rng.uniform(0.85, 1.2)), float(rng.uniform(0, 0.12))
+def fisheye_cameras(width: int = _LEFT.width) -> dict[str, Camera]:
+    """KITTI-360's fisheyes of over 180 degrees: image_02 looks to the left, image_03 to the right."""
+    left = _mounted(_scaled(_LEFT, width), (1, 0, 0), (0, 0, -1), (0, 1, 0), (-0.05, 0.45, 0.23))
+    right = _mounted(_scaled(_RIGHT, width), (-1, 0, 0), (0, 0, -1), (0, -1, 0), (-0.07, -0.45, 0.24))
+    return {"image_02": left, "image_03": right}
+
+
+def perspective_cameras(width: int = _PERSPECTIVE.width) -> dict[str, Camera]:
+    """KITTI-360's rectified pair: image_00 looks ahead from the left, image_01 0.6 m to its right."""
+    lens, tilt = _scaled(_PERSPECTIVE, width), math.radians(5)
+    down, ahead = (-math.sin(tilt), 0, -math.cos(tilt)), (math.cos(tilt), 0, -math.sin(tilt))
+    places = {"image_00": (0.80, 0.30, -0.18), "image_01": (0.80, -0.30, -0.18)}
+    return {name: _mounted(lens, (0, -1, 0), down, ahead, place) for name, place in places.items()}
+
+
+def _scaled(camera: Camera, width: int) -> Camera:
+    return camera.scaled(width / camera.width)
+
+
+def _mounted(
+    camera: Camera, right: npt.ArrayLike, down: npt.ArrayLike, ahead: npt.ArrayLike, place: npt.ArrayLike
+) -> Camera:
+    """A camera at a place, its axes given in the frame of the LiDAR."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([right, down, ahead], 1), place
+    return camera.transformed(pose)
+
+
+@functools.lru_cache(maxsize=8)
+def rays_of(camera: Camera) -> tuple[Array, Floats, Floats]:
+    """What the pixels look along, row by row, in the frame of the LiDAR.
+
+    The place of the camera (3,) in metres, unit directions (H * W, 3), 0 for pixels without a ray, and the depth (H *
+    W,) of a surface a metre along the ray.
+    """
+    import torch
+
+    rows, columns = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    pixels = torch.stack([columns, rows], -1).reshape(-1, 2).double()
+    place, directions = (value.numpy() for value in camera.sensor_rays(pixels))
+    along = directions @ np.array(camera.from_sensor)[2, :3]
+    seen = np.isfinite(along) & ((camera.model == "pinhole") | (along > math.cos(LENS_EDGE)))
+    depth = along if camera.model == "pinhole" else np.ones_like(along)
+    return (
+        place,
+        np.where(seen[:, None], directions, 0).astype(np.float32),
+        np.where(seen, depth, 0).astype(np.float32),
     )
-
-
-def render(
-    camera: Pinhole, scenes: list[Scene], pose: Array, light: Light, rng: np.random.Generator
-) -> npt.NDArray[np.uint8]:
-    """A picture (height, width, 3) RGB. `pose` (4, 4) is that of the LiDAR in the world."""
-    directions = np.ascontiguousarray(camera.rays().reshape(-1, 3) @ pose[:3, :3].T.astype(np.float32))
-    place = (pose[:3, :3] @ camera.place + pose[:3, 3]).astype(np.float32)
-    origins = np.ascontiguousarray(np.broadcast_to(place, directions.shape))
-    hits = first_hits(scenes, origins, directions)
-    seen = hits.semantic > 0
-    colour = _sky(directions, light)
-    colour[seen] = _surface(hits, origins, directions, seen, scenes, light, rng)
-    haze = 1 - np.exp(-np.minimum(hits.distance, 1e3) / 420)[:, None]
-    colour = np.where(seen[:, None], colour * (1 - haze) + np.array([0.72, 0.78, 0.86]) * haze, colour)
-    grain = rng.normal(0, 0.008, colour.shape)
-    tone = np.clip(colour * light.exposure + grain, 0, 1) ** (1 / 1.9)
-    return np.asarray(np.round(tone * 255), np.uint8).reshape(camera.height, camera.width, 3)
-
-
-def _surface(
-    hits: Hits, origins: Floats, directions: Floats, seen: npt.NDArray[np.bool_], scenes: list[Scene], light: Light,
-    rng: np.random.Generator,
-) -> Array:  # fmt: skip
-    """Lambertian light of sun and sky on what was hit, with cast shadows and a little gloss on glass and paint."""
-    sun = np.array(light.sun, np.float32)
-    normal = hits.normal[seen]
-    normal = np.where((normal * directions[seen]).sum(1, keepdims=True) > 0, -normal, normal)
-    place = origins[seen] + directions[seen] * hits.distance[seen, None] + normal * 0.01
-    towards = np.ascontiguousarray(np.broadcast_to(sun, place.shape))
-    facing = np.maximum(normal @ sun, 0)
-    lit = np.flatnonzero(facing > 0)
-    shadow = np.zeros(len(place), bool)
-    for scene in scenes:
-        shadow[lit] |= scene.cast(np.ascontiguousarray(place[lit]), towards[lit])[1] >= 0
-    leafy = hits.semantic[seen] == 70  # leaves let some of the light through
-    direct = np.where(shadow, 0.0, np.where(leafy, 0.35 + 0.5 * facing, facing))[:, None]
-    ambient = (0.30 + 0.14 * normal[:, 2:]) * np.array([0.92, 1.0, 1.12])
-    sunlight = 0.85 * np.array([1 + light.warmth, 1.0, 1 - light.warmth])
-    albedo = hits.colour[seen] ** 1.6 * _texture(place, hits.semantic[seen])[:, None]
-    mirror = directions[seen] - 2 * (directions[seen] * normal).sum(1, keepdims=True) * normal
-    glossy = (hits.reflectance[seen] < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.25, 0, 1) * 0.4
-    return np.asarray(albedo * (ambient + sunlight * direct) + glossy * np.array([0.6, 0.72, 0.9]))
-
-
-def _texture(place: Floats, semantic: npt.NDArray[np.uint16]) -> Array:
-    """Mottling of surfaces that depends on the place alone: coarse on grass, fine on asphalt."""
-    scale = np.where(np.isin(semantic, (70, 72)), 2.3, 6.0)
-    phase = place * scale[:, None]
-    waves = np.sin(phase[:, 0] * 1.7 + np.sin(phase[:, 1] * 2.3)) * np.sin(
-        phase[:, 1] * 1.3 + np.sin(phase[:, 2] * 2.9)
-    )
-    cell = np.floor(place.astype(np.float64) / 0.06) @ np.array([12.9898, 78.233, 37.719])
-    speckle = np.modf(np.abs(np.sin(cell)) * 43758.5453)[0] - 0.5
-    return np.asarray(1 + 0.07 * waves + 0.14 * speckle)
-
-
-def _sky(directions: Floats, light: Light) -> Array:
-    """Blue above, pale at the horizon, a glow around the sun."""
-    up = np.clip(directions[:, 2:], 0, 1) ** 0.5
-    blue = np.array([0.78, 0.85, 0.92]) * (1 - up) + np.array([0.25, 0.45, 0.80]) * up
-    glow = np.clip(directions @ np.array(light.sun, np.float32), 0, 1)[:, None] ** 24
-    return np.asarray(blue + 0.3 * glow * np.array([1.0, 0.95, 0.85]))

@@ -8,12 +8,12 @@ from functools import cached_property
 import numpy as np
 
 from lidarfw_town.bodies import KINDS
+from lidarfw_town.light import WEATHER
 from lidarfw_town.mesh import Array, Mesh, join
 from lidarfw_town.sensors import Floats, Hits, Lidar, Scene, first_hits, receive
 from lidarfw_town.traffic import Mover, Parked, Traffic
 from lidarfw_town.world import World
 
-WEATHER = {"clear": 0.0, "rain": 0.003, "fog": 0.015}  # extinction per metre
 SEEN_FROM = 120.0  # metres: objects farther away are not simulated
 _MOVES = 0.3  # m/s from which on an object counts as moving
 
@@ -70,7 +70,7 @@ class Drive:
         world: World | None = None,
     ) -> None:
         self.seed, self.traversal, self.lidar, self.compensated = seed, traversal, lidar, compensated
-        self._weather = WEATHER[weather]
+        self.weather = weather
         self.world = world or World(seed)
         self.traffic = Traffic(self.world, traversal, steps, circuit=circuit)
         self._directions, self._shares = lidar.rays()
@@ -114,7 +114,7 @@ class Drive:
         movers = Scene(join([body for thing, body, _ in bodies if isinstance(thing, Mover)]))
         origins, directions = self._rays(step)
         hits = first_hits([self.still, movers], origins, directions)
-        scan = receive(self.lidar, hits, directions, rng, self._weather)
+        scan = receive(self.lidar, hits, directions, rng, WEATHER[self.weather])
         back = scan.range.ravel() > 0.5
         local = self._directions.reshape(-1, 3)[back] * scan.range.ravel()[back, None]
         if self.compensated:

@@ -10,9 +10,10 @@ import numpy.typing as npt
 from lidarfw.files import atomic_path
 
 from lidarfw_town.bodies import KINDS
-from lidarfw_town.camera import kitti_camera, light_of, render
+from lidarfw_town.camera import kitti_camera
 from lidarfw_town.drive import Drive, TownFrame
 from lidarfw_town.mesh import Array
+from lidarfw_town.render import photograph
 from lidarfw_town.sensors import Lidar
 
 if TYPE_CHECKING:
@@ -121,9 +122,7 @@ def _outline(box: tuple[float, ...]) -> Array:
 
 
 def _draw_camera(axes: Axes, drive: Drive, frame: TownFrame) -> None:
-    light = light_of(drive.seed, drive.traversal)
-    rng = np.random.default_rng(0)
-    axes.imshow(render(kitti_camera(), [drive.still, frame.movers], frame.pose, light, rng))
+    axes.imshow(photograph(drive, frame, kitti_camera()).image)
     axes.set_axis_off()
     axes.set_title("camera", loc="left")
 
