@@ -1,4 +1,4 @@
-"""The command line: `lidarfw train|eval|predict|list|show|check|new|prepare|bench|completion`."""
+"""The command line: `lidarfw train|eval|predict|track|list|show|check|new|prepare|bench|completion`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ COMMANDS = {
     "train": "train a model: components and settings as overrides (head=center optimizer.lr=0.01)",
     "eval": "measure a checkpoint on a dataset",
     "predict": "run a checkpoint on scans or images and write results and pictures",
+    "track": "follow the boxes of any detector through a sequence and write the official result files",
     "list": "what is installed, by slot",
     "show": "how components would be wired, and how large the model is",
     "check": "test a plugin or component against the rules of its interface",

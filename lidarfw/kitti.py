@@ -59,7 +59,7 @@ class Label:
         """The line of the file, without the line end."""
         head = f"{self.type} {self.truncation:g} {self.occlusion} {self.alpha:.4f}"
         numbers = (*self.box2d, *self.size, *self.location, self.rotation_y)
-        tail = "" if self.score is None else f" {self.score:.6f}"
+        tail = "" if self.score is None else f" {self.score:.12g}"
         return " ".join([head, *(f"{number:.4f}" for number in numbers)]) + tail
 
 

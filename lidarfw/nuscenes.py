@@ -28,6 +28,7 @@ CLASSES = (
     "car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle", "bicycle", "traffic_cone",
     "barrier",
 )  # fmt: skip
+TRACKED = ("bicycle", "bus", "car", "motorcycle", "pedestrian", "trailer", "truck")  # of the tracking benchmark
 CATEGORIES = {  # of the detection benchmark; other categories are not learnt
     "movable_object.barrier": "barrier",
     "movable_object.trafficcone": "traffic_cone",
@@ -195,6 +196,15 @@ def _sensor_data(tables: Tables, samples: Mapping[str, Row]) -> list[Row]:
     for row, pose in zip(chosen, vehicle @ mounted, strict=True):
         row["pose"] = pose
     return chosen
+
+
+def lidar_poses(folder: Path) -> dict[str, Array]:
+    """Pose (4, 4) of the LiDAR in the global frame, in our axes, at the key frame of every sample, by its token."""
+    tables = Tables(folder)
+    samples = {row["token"]: row for row in tables.rows("sample")}
+    rows = [row for row in _sensor_data(tables, samples) if row["channel"] == LIDAR and row["is_key_frame"]]
+    to_ours = FROM_NUSCENES.T  # a rotation: its inverse
+    return {row["sample_token"]: row["pose"] @ to_ours for row in rows}
 
 
 def transforms(rows: Sequence[Row], path: Path) -> Array:
