@@ -15,6 +15,7 @@ from lidarfw.ops.boxes import (
 from lidarfw.ops.cells import (
     CellAssignment,
     assign_cells,
+    find_voxels,
     group_points,
     scatter_max,
     scatter_mean,
@@ -24,7 +25,7 @@ from lidarfw.ops.cells import (
 from lidarfw.ops.neighbors import ball_query, farthest_points, knn, three_interpolate
 from lidarfw.ops.nms import nms_circle, nms_rotated
 from lidarfw.ops.pose import kabsch, ransac_pose, transform
-from lidarfw.ops.range_image import range_knn, range_project, residual_images
+from lidarfw.ops.range_image import range_knn, range_knn_mean, range_match, range_project, residual_images
 from lidarfw.ops.sparse_conv import SparseConv3d, SparseInverseConv3d, SparseModule, SubmanifoldConv3d
 from lidarfw.ops.sparse_layers import SparseAvgPool3d, SparseMaxPool3d, SparseSequential, from_dense, fuse, to_dense
 
@@ -41,6 +42,7 @@ __all__ = [
     "ball_query",
     "box_corners",
     "farthest_points",
+    "find_voxels",
     "from_dense",
     "fuse",
     "giou_3d",
@@ -58,6 +60,8 @@ __all__ = [
     "points_in_boxes",
     "points_in_boxes_mask",
     "range_knn",
+    "range_knn_mean",
+    "range_match",
     "range_project",
     "ransac_pose",
     "residual_images",

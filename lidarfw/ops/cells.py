@@ -198,3 +198,15 @@ def group_points(cells: CellAssignment, maximum: int) -> tuple[Tensor, Tensor]:
     position = torch.where(mask, cells.starts[:-1, None] + slot, 0)
     rows = cells.order[position] if cells.order.numel() else position
     return torch.where(mask, rows, 0), mask
+
+
+def find_voxels(voxels: Voxels, batch: Tensor, cell: Tensor) -> Tensor:
+    """Row (...) of each cell (..., 3) z, y, x of a sample (...), len(voxels) where that cell is empty or outside."""
+    b, z, y, x = voxels.index.unbind(1)
+    keys = cell_key((b, z, y, x), voxels.shape)
+    z, y, x = cell.unbind(-1)
+    wanted = cell_key((batch, z, y, x), voxels.shape)
+    within = ((cell >= 0) & (cell < cell.new_tensor(voxels.shape))).all(-1)
+    rows = torch.searchsorted(keys, wanted)
+    found = within & (torch.cat([keys, keys.new_tensor([-1])])[rows] == wanted)
+    return torch.where(found, rows, len(voxels))

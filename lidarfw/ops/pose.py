@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -43,78 +46,128 @@ def ransac_pose(
     pairs: SceneCoords,
     *,
     threshold: float = 0.6,
-    hypotheses: int = 1000,
-    refinements: int = 5,
-    minimum_inliers: int = 4,
+    hypotheses: int = 512,
+    least_share: float = 0.1,
+    edge_ratio: float = 0.9,
+    shortest_edge: float = 0.0,
+    refinements: int = 20,
+    minimum_inliers: int = 6,
     seed: int = 0,
 ) -> Poses:
     """Pose of every sample from pairs of which many may be wrong.
 
-    Fischler and Bolles (1981) with the MSAC score of Torr and Zisserman, "MLESAC" (CVIU 2000), section 3: the
-    hypothesis with the least sum of min(squared error, threshold^2) wins and is refitted to its inliers. All
-    hypotheses of a sample are fitted and scored together. Not differentiable.
+    Fischler and Bolles (1981) with the MSAC score of Torr and Zisserman, "MLESAC" (CVIU 2000), section 3: triples of
+    pairs are drawn, those that are not rigid are dropped before anything is fitted, and of the others the pose with
+    the least sum of min(squared error, threshold^2) wins. It is refitted to its inliers with weights
+    1 / (1 + (error / threshold)^2) until these no longer change. All hypotheses of a sample are fitted and scored
+    together. Not differentiable.
 
     Args:
         pairs: pairs of weight 0 are never drawn and never counted; a weight counts in the score and the fit.
         threshold: metres up to which a pair is an inlier.
-        hypotheses: triples drawn for each sample, by the pairs' weights.
-        refinements: at most so many refits; they stop where the inliers no longer change.
+        hypotheses: triples that are fitted at most.
+        least_share: so many triples are drawn that one of inliers only is among them with a probability of 99.9 %
+            where at least this share of the pairs are inliers.
+        edge_ratio: the sides of a triple must agree between sensor and map up to this ratio, below 1.
+        shortest_edge: metres that each side must have at least; triples that fit neither are taken last.
+        refinements: at most so many refits.
+        minimum_inliers: fewer inliers than this, or than 1 % of the pairs, are no pose, and neither is a line of them.
         seed: of the draw; the same for every sample, so a sample's pose does not depend on the others.
 
     Returns:
-        `ok` is False, and the matrix the identity, where fewer than `minimum_inliers` pairs agree;
-        `confidence` is the weighted share of inliers.
+        `confidence` is the weighted share of inliers. Where no pose was found `ok` is False, `confidence` 0 and the
+        matrix the least-squares fit to all pairs, or the identity where there are fewer than three.
     """
-    found = [_robust_fit(p, threshold, hypotheses, refinements, minimum_inliers, seed) for p in pairs.samples()]
+    draws = max(iterations(least_share), hypotheses)
+    found = []
+    for sample in pairs.samples():
+        fit = _Fit.of(sample, threshold)
+        found.append(fit.pose(draws, hypotheses, (edge_ratio, shortest_edge), refinements, minimum_inliers, seed))
     matrix, ok, confidence = (torch.stack(values) for values in zip(*found, strict=True))
     return Poses(matrix, ok, confidence)
 
 
-def _robust_fit(
-    pairs: SceneCoords, threshold: float, hypotheses: int, refinements: int, minimum: int, seed: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Matrix (4, 4), ok and confidence of one sample."""
-    source, world, weight = pairs.source.detach(), pairs.world.detach(), pairs.weight.detach().to(pairs.source.dtype)
-    identity = torch.eye(4, dtype=source.dtype, device=source.device)
-    none = identity, torch.zeros((), dtype=torch.bool, device=source.device), source.new_zeros(())
-    if int((weight > 0).sum()) < max(minimum, 3):
-        return none
-    center_s, center_w = source.mean(0), world.mean(0)  # far coordinates lose digits in float32
-    source, world = source - center_s, world - center_w
-    triples = _draw(weight, hypotheses, seed)
-    matrices = kabsch(source[triples], world[triples])
-    matrix = matrices[_msac_scores(matrices, source, world, weight, threshold).argmin()]
-    inlier = _inliers(matrix, source, world, weight, threshold)
-    for _ in range(refinements):
-        matrix = kabsch(source, world, weight * inlier) if int(inlier.sum()) >= 3 else matrix
-        before, inlier = inlier, _inliers(matrix, source, world, weight, threshold)
-        if torch.equal(before, inlier):
-            break
-    if int(inlier.sum()) < minimum:
-        return none
-    matrix[:3, 3] += center_w - matrix[:3, :3] @ center_s
-    return matrix, torch.ones_like(none[1]), (weight * inlier).sum() / weight.sum()
+def iterations(share: float, probability: float = 0.999) -> int:
+    """Draws of three pairs after which one holds inliers only with that probability, at that share of inliers."""
+    return max(1, math.ceil(math.log(1 - probability) / math.log(1 - min(share, 1 - 1e-9) ** 3)))
 
 
-def _draw(weight: Tensor, hypotheses: int, seed: int) -> Tensor:
-    """(hypotheses, 3) rows drawn by weight. A triple that holds a row twice fits badly and loses."""
-    generator = torch.Generator(weight.device).manual_seed(seed)
-    return torch.multinomial(weight, 3 * hypotheses, replacement=True, generator=generator).view(hypotheses, 3)
+@dataclass
+class _Fit:
+    """The pairs of one sample about their means (far coordinates lose digits in float32)."""
 
+    source: Tensor  # (N, 3)
+    world: Tensor  # (N, 3)
+    weight: Tensor  # (N,)
+    centers: tuple[Tensor, Tensor]
+    threshold: float
 
-def _squared_errors(matrices: Tensor, source: Tensor, world: Tensor) -> Tensor:
-    """(H, N) squared distance of each pair under each of the matrices (H, 4, 4)."""
-    moved = matrices[:, :3, :3].reshape(-1, 3) @ source.t()
-    apart = moved.view(len(matrices), 3, -1) + matrices[:, :3, 3:] - world.t()
-    return apart.square_().sum(1)
+    @classmethod
+    def of(cls, pairs: SceneCoords, threshold: float) -> _Fit:
+        source, world = pairs.source.detach(), pairs.world.detach()
+        weight = pairs.weight.detach().to(source.dtype)
+        usable = (weight > 0) & world.isfinite().all(1) & source.isfinite().all(1)
+        source, world, weight = source[usable], world[usable].to(source.dtype), weight[usable]
+        centers = source.sum(0) / max(len(source), 1), world.sum(0) / max(len(world), 1)
+        return cls(source - centers[0], world - centers[1], weight, centers, threshold)
 
+    def pose(
+        self, draws: int, hypotheses: int, edges: tuple[float, float], refinements: int, minimum: int, seed: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Matrix (4, 4), ok and confidence."""
+        no = torch.zeros((), dtype=torch.bool, device=self.source.device), self.source.new_zeros(())
+        if len(self.source) < 3:
+            return torch.eye(4, dtype=self.source.dtype, device=self.source.device), *no
+        triples = self._draw(draws, seed)
+        triples = triples[self._rigid_first(triples, *edges)[:hypotheses]]
+        matrices = kabsch(self.source[triples], self.world[triples])
+        matrix, inlier = self._refined(matrices[self._msac_scores(matrices).argmin()], refinements)
+        if int(inlier.sum()) < max(minimum, len(self.source) / 100) or self._on_a_line(inlier):
+            return self._uncentred(kabsch(self.source, self.world, self.weight)), *no
+        confidence = (self.weight * inlier).sum() / self.weight.sum()
+        return self._uncentred(matrix), torch.ones_like(no[0]), confidence
 
-def _msac_scores(matrices: Tensor, source: Tensor, world: Tensor, weight: Tensor, threshold: float) -> Tensor:
-    """(H,) weighted sum of min(squared error, threshold^2); low is good."""
-    rows = max(_RESIDUALS // len(source), 1)
-    blocks = matrices.split(rows)  # type: ignore[no-untyped-call]
-    return torch.cat([_squared_errors(m, source, world).clamp_(max=threshold**2) @ weight for m in blocks])
+    def _draw(self, count: int, seed: int) -> Tensor:
+        """(count, 3) rows drawn by weight. A triple that holds a row twice is not rigid and fits badly."""
+        generator = torch.Generator(self.weight.device).manual_seed(seed)
+        return torch.multinomial(self.weight, 3 * count, replacement=True, generator=generator).view(count, 3)
 
+    def _rigid_first(self, triples: Tensor, ratio: float, shortest: float) -> Tensor:
+        """Order of the triples: first those whose sides are as long in the map as in the sensor frame."""
+        sides = [(p[triples] - p[triples.roll(1, 1)]).norm(dim=2) for p in (self.source, self.world)]
+        low, high = torch.minimum(*sides), torch.maximum(*sides)
+        rigid = ((low >= ratio * high) & (low > shortest)).all(1)
+        return rigid.byte().argsort(descending=True, stable=True)
 
-def _inliers(matrix: Tensor, source: Tensor, world: Tensor, weight: Tensor, threshold: float) -> Tensor:
-    return (_squared_errors(matrix[None], source, world)[0] <= threshold**2) & (weight > 0)
+    def _squared_errors(self, matrices: Tensor) -> Tensor:
+        """(H, N) squared distance of each pair under each of the matrices (H, 4, 4)."""
+        moved = matrices[:, :3, :3].reshape(-1, 3) @ self.source.t()
+        apart = moved.view(len(matrices), 3, -1) + matrices[:, :3, 3:] - self.world.t()
+        return apart.square_().sum(1)
+
+    def _msac_scores(self, matrices: Tensor) -> Tensor:
+        """(H,) weighted sum of min(squared error, threshold^2); low is good."""
+        rows = max(_RESIDUALS // len(self.source), 1)
+        blocks = matrices.split(rows)  # type: ignore[no-untyped-call]
+        return torch.cat([self._squared_errors(m).clamp_(max=self.threshold**2) @ self.weight for m in blocks])
+
+    def _refined(self, matrix: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
+        """The matrix refitted to its inliers until they stay the same, and which these are (N,)."""
+        inlier = torch.zeros_like(self.weight, dtype=torch.bool)
+        for step in range(rounds + 1):
+            squared = self._squared_errors(matrix[None])[0] / self.threshold**2
+            before, inlier = inlier, squared <= 1
+            if step == rounds or int(inlier.sum()) < 3 or torch.equal(before, inlier):
+                break
+            matrix = kabsch(self.source, self.world, self.weight * inlier / (1 + squared))
+        return matrix, inlier
+
+    def _on_a_line(self, inlier: Tensor) -> bool:
+        """Whether the inliers leave the turn about their common line open."""
+        spread = torch.linalg.svdvals(self.source[inlier] - self.source[inlier].mean(0))
+        return bool(spread[1] <= 1e-3 * spread[0])
+
+    def _uncentred(self, matrix: Tensor) -> Tensor:
+        matrix = matrix.clone()
+        matrix[:3, 3] += self.centers[1] - matrix[:3, :3] @ self.centers[0]
+        return matrix

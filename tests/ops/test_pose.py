@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from lidarfw.ops import kabsch, ransac_pose, transform
+from lidarfw.ops.pose import iterations
 from lidarfw.types import SceneCoords
 
 
@@ -95,6 +96,26 @@ def test_samples_without_a_pose_are_marked() -> None:
     batch = SceneCoords.cat([good, nothing, few, noise, unweighted], as_batch=True)
     poses = ransac_pose(batch, threshold=0.1, minimum_inliers=8)
     assert poses.ok.tolist() == [True, False, False, False, False]
-    assert torch.equal(poses.matrix[1:], torch.eye(4).expand(4, 4, 4))
+    assert torch.equal(poses.matrix[[1, 2, 4]], torch.eye(4).expand(3, 4, 4))
+    torch.testing.assert_close(poses.matrix[3], kabsch(noise.source, noise.world))  # the best guess there is
     assert poses.confidence[1:].sum() == 0
     assert poses.matrix.isfinite().all()
+
+
+def test_pairs_on_a_line_are_no_pose() -> None:
+    source = torch.linspace(-20, 20, 40)[:, None] * torch.tensor([1.0, 2.0, 0.5])
+    pairs = SceneCoords(source, source + 3, torch.ones(40), torch.zeros(40, dtype=torch.long))
+    assert not ransac_pose(pairs).ok[0]
+
+
+def test_exact_pairs_among_random_ones() -> None:
+    pose, source = random_pose(5), random_points(100, seed=1) * 4
+    world = transform(pose, source)
+    world[60:] = random_points(40, seed=2) * 8
+    found = ransac_pose(SceneCoords(source, world, torch.ones(100), torch.zeros(100).long()), threshold=1.2)
+    torch.testing.assert_close(found.matrix[0], pose, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.6, 29), (0.3, 253), (0.1, 6905), (1.0, 1)])
+def test_draws_that_find_three_inliers(share: float, expected: int) -> None:
+    assert iterations(share) == expected

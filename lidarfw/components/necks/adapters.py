@@ -12,8 +12,7 @@ from lidarfw.components.backbones.pillars import PillarEncoder
 from lidarfw.components.layers import grid_from_options
 from lidarfw.errors import DataError
 from lidarfw.interfaces import Neck
-from lidarfw.ops import from_dense, voxelize_mean
-from lidarfw.ops.cells import cell_key
+from lidarfw.ops import find_voxels, from_dense, voxelize_mean
 from lidarfw.types import BEV, Points, RangeImage, Spec, Voxels
 
 
@@ -126,17 +125,5 @@ def _surrounding_voxels(voxels: Voxels, points: Points) -> tuple[Tensor, Tensor]
     corners = torch.tensor(list(product((0, 1), repeat=3)), device=place.device)
     cell = torch.floor(place)[:, None].long() + corners  # (N, 8, 3)
     weights = (1 - (place[:, None] - cell).abs()).prod(2)
-    rows = _find_voxels(voxels, points.batch[:, None].expand(-1, 8), cell)
+    rows = find_voxels(voxels, points.batch[:, None].expand(-1, 8), cell)
     return rows, weights * ((rows < len(voxels)) & inside[:, None])
-
-
-def _find_voxels(voxels: Voxels, batch: Tensor, cell: Tensor) -> Tensor:
-    """Row of each cell (..., 3) z, y, x of a sample (...), len(voxels) where that cell is empty or outside."""
-    b, z, y, x = voxels.index.unbind(1)
-    keys = cell_key((b, z, y, x), voxels.shape)
-    z, y, x = cell.unbind(-1)
-    wanted = cell_key((batch, z, y, x), voxels.shape)
-    within = (cell < cell.new_tensor(voxels.shape)).all(-1)
-    rows = torch.searchsorted(keys, wanted)
-    found = within & (torch.cat([keys, keys.new_tensor([-1])])[rows] == wanted)
-    return torch.where(found, rows, len(voxels))

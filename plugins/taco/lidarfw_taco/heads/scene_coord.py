@@ -1,0 +1,177 @@
+"""Scene-coordinate regression: where in the map each part of the scan lies.
+
+Sources: TACO, section 4; Li et al., "SGLoc: Scene Geometry Encoding for Outdoor LiDAR Localization", CVPR 2023; Yang
+et al., "LiSA", CVPR 2024 (shift); Li et al., "LightLoc", CVPR 2025 (absolute).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lidarfw.components.layers import BatchNorm1d
+from lidarfw.errors import ConfigError
+from lidarfw.interfaces import Head
+from lidarfw.ops import find_voxels, scatter_mean, to_dense, transform
+from lidarfw.types import BEV, Points, Poses, Record, SceneCoords, Spec, Targets, Voxels
+
+TARGETS = ("absolute", "shift")
+CALIBRATION = 100  # training batches that set origin and scale
+
+
+@dataclass
+class SceneCoordOutput(Record):
+    """What the scene-coordinate heads return."""
+
+    pairs: SceneCoords  # weight 1
+    tap: BEV  # what the last layer reads, the maximum over z; 0 where there is no point
+
+
+class CoordinateRegressor(nn.Module):
+    """Features of cells -> map coordinates: a residual layer, the tap, and a linear layer that reads the tap.
+
+    The last layer works in a normalised frame: `origin` and `scale` (metres) are the mean of what is to be predicted
+    and its mean distance from it, over the first `CALIBRATION` training batches, and stand still from then on. So
+    the map may lie anywhere, be of any size, and the loss stays in metres.
+    """
+
+    origin: Tensor
+    scale: Tensor
+    batches: Tensor
+
+    def __init__(self, in_channels: int, hidden: int, tap_channels: int, target: str) -> None:
+        super().__init__()
+        if target not in TARGETS:
+            raise ConfigError(f"scene_coord: target is {target!r}.\n  fix: target: {' or '.join(TARGETS)}")
+        self.shift = target == "shift"
+        self.convs = nn.Sequential(
+            nn.Linear(in_channels, hidden, bias=False), BatchNorm1d(hidden), nn.LeakyReLU(),
+            nn.Linear(hidden, hidden, bias=False), BatchNorm1d(hidden),
+        )  # fmt: skip
+        self.shortcut = nn.Sequential(nn.Linear(in_channels, hidden, bias=False), BatchNorm1d(hidden))
+        self.bottleneck = nn.Linear(hidden, tap_channels)
+        self.last = nn.Linear(tap_channels, 3)
+        self.register_buffer("origin", torch.zeros(3))
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("batches", torch.zeros((), dtype=torch.long))
+
+    def forward(self, features: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
+        """Map coordinates (N, 3) in metres and the tap (N, C), not negative, of cells (N, C) around source (N, 3)."""
+        hidden = nn.functional.leaky_relu(self.convs(features) + self.shortcut(features))
+        tap = nn.functional.relu(self.bottleneck(hidden))
+        with torch.autocast(tap.device.type, enabled=False):  # metres in 16 bit are off by half a metre at 100 m
+            world = self.origin + self.scale * self.last(tap.float())
+        return (world + source if self.shift else world), tap
+
+    @torch.no_grad()
+    def calibrate(self, source: Tensor, batch: Tensor, poses: Poses | None) -> None:
+        """Count a training batch into origin and scale."""
+        if poses is None or int(self.batches) >= CALIBRATION:
+            return
+        known = poses.ok[batch]
+        source, batch = source[known], batch[known]
+        if not len(source):
+            return
+        wanted = transform(poses.matrix.to(source.dtype)[batch], source[:, None])[:, 0]
+        wanted = wanted - source if self.shift else wanted
+        self.batches += 1
+        self.origin += (wanted.mean(0) - self.origin) / self.batches
+        spread = (wanted - self.origin).abs().mean().clamp(min=1.0)
+        self.scale += (spread - self.scale) / self.batches
+
+
+class SceneCoordHead(Head):
+    """Map coordinates of every voxel (TACO, section 4): the pairs from which `pose_ransac` finds the pose.
+
+    A pair is the mean of the points in a voxel (sensor frame) and its predicted place in the map. With `target`
+    absolute the network says that place itself; with shift it says the difference, as SGLoc and LiSA do, which is
+    better where the heading hardly varies. The tap is the input of the last layer, `tap_channels` wide and not
+    negative, as a map with the maximum over z. Voxels without a point give no pair.
+    """
+
+    defaults = {"loss": ["scene_coord"], "postprocessor": ["pose_ransac"], "metric": ["pose_error"]}
+
+    def __init__(
+        self, voxels: Spec, points: Spec, *, target: str = "absolute", hidden: int = 4096, tap_channels: int = 64
+    ) -> None:
+        super().__init__()
+        self.regressor = CoordinateRegressor(voxels.channels, hidden, tap_channels, target)
+        self.tap = Spec(BEV, tap_channels, voxels.stride, voxels.geometry)
+        self.provides = Spec(SceneCoords)
+
+    def forward(self, voxels: Voxels, points: Points, targets: Targets | None = None) -> SceneCoordOutput:
+        """One pair per voxel that holds a point."""
+        source, kept = _means_in_voxels(points, voxels)
+        cells = Voxels(
+            voxels.features[kept], voxels.index[kept], voxels.grid, voxels.shape, voxels.strides, voxels.batch_size
+        )
+        batch = cells.index[:, 0]
+        if targets is not None and self.training:
+            self.regressor.calibrate(source, batch, targets.poses)
+        world, tap = self.regressor(cells.features, source)
+        pairs = SceneCoords(source, world, torch.ones_like(world[:, 0]), batch, voxels.batch_size)
+        highest = to_dense(cells.with_features(tap)).amax(2)
+        return SceneCoordOutput(pairs, BEV(highest, voxels.grid, voxels.stride))
+
+    def decode(self, output: SceneCoordOutput) -> SceneCoords:
+        """The pairs."""
+        return output.pairs
+
+
+class SceneCoordBEVHead(Head):
+    """Map coordinates of every column of a bird's-eye-view map that holds a point: `scene_coord` for 2D backbones.
+
+    Options and tap are those of `scene_coord`; a pair is the mean of the points in the column.
+    """
+
+    defaults = {"loss": ["scene_coord"], "postprocessor": ["pose_ransac"], "metric": ["pose_error"]}
+
+    def __init__(
+        self, bev: Spec, points: Spec, *, target: str = "absolute", hidden: int = 4096, tap_channels: int = 64
+    ) -> None:
+        super().__init__()
+        self.regressor = CoordinateRegressor(bev.channels, hidden, tap_channels, target)
+        self.tap = Spec(BEV, tap_channels, bev.stride, bev.geometry)
+        self.provides = Spec(SceneCoords)
+
+    def forward(self, bev: BEV, points: Points, targets: Targets | None = None) -> SceneCoordOutput:
+        """One pair per column that holds a point."""
+        source, column = _means_in_columns(points, bev)
+        samples, _, height, width = bev.features.shape
+        batch = column // (height * width)
+        if targets is not None and self.training:
+            self.regressor.calibrate(source, batch, targets.poses)
+        rows = bev.features.permute(0, 2, 3, 1).flatten(0, 2)
+        world, tap = self.regressor(rows[column], source)
+        pairs = SceneCoords(source, world, torch.ones_like(world[:, 0]), batch, samples)
+        flat = tap.new_zeros(samples * height * width, tap.shape[1]).index_copy(0, column, tap)
+        spread = flat.view(samples, height, width, -1).permute(0, 3, 1, 2)
+        return SceneCoordOutput(pairs, BEV(spread, bev.grid, bev.stride))
+
+    def decode(self, output: SceneCoordOutput) -> SceneCoords:
+        """The pairs."""
+        return output.pairs
+
+
+def _means_in_voxels(points: Points, voxels: Voxels) -> tuple[Tensor, Tensor]:
+    """Mean (N, 3) of the points in each voxel that holds one, and the rows (N,) of those voxels."""
+    cell, inside = voxels.grid.index(points.xyz)
+    rows = find_voxels(voxels, points.batch, cell // cell.new_tensor(voxels.strides))
+    return _means(points.xyz, torch.where(inside & (rows < len(voxels)), rows, -1), len(voxels))
+
+
+def _means_in_columns(points: Points, bev: BEV) -> tuple[Tensor, Tensor]:
+    """Mean (N, 3) of the points in each column that holds one, and the columns (N,): flat index b*H*W + row*W + x."""
+    samples, _, height, width = bev.features.shape
+    cell, inside = bev.grid.index(points.xyz)
+    _, row, column = (cell // bev.stride).unbind(1)
+    flat = (points.batch * height + row) * width + column
+    return _means(points.xyz, torch.where(inside, flat, -1), samples * height * width)
+
+
+def _means(xyz: Tensor, cell: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Means of the points (P, 3) by cell (P,), -1 for none, and the cells that have a point, ascending."""
+    kept = torch.bincount(cell + 1, minlength=size + 1)[1:].nonzero()[:, 0]
+    return scatter_mean(xyz, cell, size)[kept], kept
