@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 from lidarfw.errors import LidarfwError
 
-from lidarfw_town.drive import WEATHER
 from lidarfw_town.generate import Job, generate
 from lidarfw_town.layouts import LAYOUTS
+from lidarfw_town.light import WEATHER
 from lidarfw_town.sensors import LIDARS
 
 

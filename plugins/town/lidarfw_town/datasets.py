@@ -5,26 +5,96 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
+from lidarfw.components.datasets.drives import DriveDataset
 from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
+from lidarfw.components.datasets.oxford import OxfordDataset
+from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.errors import DataError
+from lidarfw.interfaces.data import Dataset
 
 from lidarfw_town.version import VERSION
 
-VALIDATION_SHARE = 4  # a town of validation frames for four of training
+if TYPE_CHECKING:
+    from lidarfw_town.generate import Job
+
+VALIDATION_SHARE = 4  # of single frames: one of validation for four of training
 
 
-class TownKitti(KittiDataset):
-    """Frames of a simulated town in the layout of KITTI object detection, read by the loader for the real ones.
+class TownDataset(Dataset):
+    """What the datasets of the town share: files that are made on first use, in a folder named by the options.
 
-    Splits are `train` and `val`, from different towns. The files go to a cache folder named by the options, so they
-    are made once: about four frames a second with the LiDAR `small`.
+    `layout` is that of the files; `made` says which of its splits each split of the dataset reads. Options that all
+    have: sensor (hdl64, hdl32, ouster32 or small); seed (another one is another town); picture_width in pixels, 0 for
+    no pictures; weather (clear, rain or fog); cache, the folder of folders (empty: lidarfw/town in $XDG_CACHE_HOME or
+    ~/.cache); workers, the processes that make the files (0: one a core).
     """
 
-    example: ClassVar[dict[str, object]] = {"frames": 2, "picture_width": 310}
+    layout: ClassVar[str]
+    made: ClassVar[Mapping[str, str]] = {"train": "train", "val": "val"}
+
+    def _settle(self, split: str, frames: Mapping[str, int], cache: str, workers: int, **settings: str | int) -> str:
+        """Take the options that say what to make, `frames` by split of the layout; the folder of the files."""
+        if split not in self.made:
+            raise DataError(
+                f"the datasets of the town in the layout {self.layout} have the splits {', '.join(self.made)}, not "
+                f"{split!r}.\n  fix: splits.test={list(self.made)[-1]}"
+            )
+        self._frames, self._settings, self._workers = dict(frames), {"layout": self.layout, **settings}, workers
+        self._make = self.made[split]
+        mark = hashlib.sha256(json.dumps([self._settings, self._frames, VERSION]).encode()).hexdigest()[:8]
+        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        base = Path(cache) if cache else Path(home) / "lidarfw" / "town"
+        self._folder = base / f"{self.layout}-{settings['sensor']}-{frames['train']}-seed{settings['seed']}-{mark}"
+        return str(self._folder)
+
+    @property
+    def job(self) -> Job:
+        """What to make for the split."""
+        from lidarfw_town.generate import Job  # imports the ray caster, which a spec does not need
+
+        return Job(root=str(self._folder), split=self._make, frames=self._frames[self._make], **self._settings)  # type: ignore[arg-type]
+
+    def prepare(self) -> None:
+        """Make the files of the split, unless they stand."""
+        from lidarfw_town.generate import generate
+
+        generate(self.job, self._workers or os.cpu_count() or 1)
+        super().prepare()
+
+
+class TownDrives(TownDataset, DriveDataset):
+    """Datasets of whole drives. Options that all have: `drives` of training, and of each the frames `length`, which
+    are `stride` steps of 0.1 s apart. There are half as many of the other split, one at least.
+    """
+
+    def _settle_drives(
+        self, split: str, drives: int, length: int, cache: str, workers: int, **settings: str | int
+    ) -> str:
+        held_out = next(name for name in self.made.values() if name != "train")
+        most = max(len(self.splits[name]) for name, files in self.made.items() if files == held_out)
+        self._drives = {"train": drives, held_out: min(max(drives // 2, 1), most)}
+        frames = {name: count * length for name, count in self._drives.items()}
+        return self._settle(split, frames, cache, workers, length=length, **settings)
+
+    @property
+    def named(self) -> list[str]:
+        """Those of the split's drives that are made."""
+        return super().named[: self._drives[self._make]]
+
+
+class TownKitti(TownDataset, KittiDataset):
+    """Frames of a simulated town in the layout of KITTI object detection, read by the loader for the real ones.
+
+    Splits are `train` and `val`, from different towns.
+    """
+
+    example: ClassVar[dict[str, object]] = {"frames": 2, "picture_width": 310, "workers": 1}
+    layout = "kitti"
 
     def __init__(
         self,
@@ -39,37 +109,133 @@ class TownKitti(KittiDataset):
         picture_width: int = 621,
         weather: str = "clear",
         cache: str = "",
-        workers: int = 1,
+        workers: int = 0,
     ) -> None:
         """Options.
 
         split: train or val. classes, camera_view, image: as in `kitti`. frames: of the split train; val has a quarter.
-        sensor: hdl64, hdl32, ouster32 or small. seed: another seed is another town. picture_width: pixels.
-        weather: clear, rain or fog. cache: folder for the files; empty: $XDG_CACHE_HOME or ~/.cache, lidarfw/town.
-        workers: processes that make the files; more than one needs a guarded main module.
+        The others: see `TownDataset`.
         """
-        super().__init__(split=split, classes=classes, camera_view=camera_view, image=image)
-        self.frames, self.sensor, self.seed, self.picture_width = frames, sensor, seed, picture_width
-        self.weather, self.cache, self.workers = weather, cache, workers
-        self.root = str(self._folder())
+        count = {"train": frames, "val": max(frames // VALIDATION_SHARE, 1)}
+        root = self._settle(
+            split, count, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width, weather=weather
+        )
+        super().__init__(root=root, split=split, classes=classes, camera_view=camera_view, image=image)
 
-    def prepare(self) -> None:
-        """Make the files of the split, unless they stand."""
-        from lidarfw_town.generate import Job, generate
 
-        if self.split not in ("train", "val"):
-            raise DataError(f"town_kitti has the splits train and val, not {self.split!r}.\n  fix: splits.test=val")
-        width, weather = self.picture_width, self.weather
-        job = Job("kitti", self.root, self.seed, self.frames, self.sensor, picture_width=width, weather=weather)
-        if self.split == "val":
-            job = replace(job, frames=max(self.frames // VALIDATION_SHARE, 1), split="val")
-        generate(job, self.workers)
-        super().prepare()
+class TownTracking(TownDrives, KittiTrackingDataset):
+    """Drives through simulated towns in the layout of KITTI tracking: boxes with identities, ten scans a second.
 
-    def _folder(self) -> Path:
-        options = {"frames": self.frames, "sensor": self.sensor, "seed": self.seed}
-        options |= {"picture_width": self.picture_width, "weather": self.weather}
-        mark = hashlib.sha256(json.dumps([options, VERSION]).encode()).hexdigest()[:8]
-        home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        base = Path(self.cache) if self.cache else Path(home) / "lidarfw" / "town"
-        return base / f"kitti-{self.sensor}-{self.frames}-seed{self.seed}-{mark}"
+    Splits are `train` and `val`, every drive in another town.
+    """
+
+    example: ClassVar[dict[str, object]] = {"drives": 1, "length": 3, "workers": 1}
+    layout = "kitti_tracking"
+
+    def __init__(
+        self,
+        *,
+        split: str = "train",
+        classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"),
+        camera_view: bool = True,
+        poses: str = "oxts",
+        sweeps: int = 1,
+        pose: bool = False,
+        drives: int = 4,
+        length: int = 60,
+        sensor: str = "small",
+        seed: int = 1,
+        picture_width: int = 0,
+        weather: str = "clear",
+        cache: str = "",
+        workers: int = 0,
+    ) -> None:
+        """Options.
+
+        split: train or val. classes, camera_view, poses, sweeps, pose: as in `kitti_tracking`. drives, length: see
+        `TownDrives`. The others: see `TownDataset`.
+        """
+        root = self._settle_drives(
+            split, drives, length, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width,
+            weather=weather,
+        )  # fmt: skip
+        super().__init__(
+            root=root, split=split, classes=classes, camera_view=camera_view, poses=poses, sweeps=sweeps, pose=pose
+        )
+
+
+class TownMos(TownDrives, SemanticKittiDataset):
+    """Drives through simulated towns in the layout of SemanticKITTI, for the segmentation of moving objects.
+
+    Splits are `train` and `val`, every drive in another town; `val` is one drive, as there. Ten scans a second.
+    """
+
+    example: ClassVar[dict[str, object]] = {"drives": 1, "length": 3, "workers": 1}
+    layout = "semantic_kitti"
+
+    def __init__(
+        self,
+        *,
+        split: str = "train",
+        task: str = "moving",
+        sweeps: int = 1,
+        pose: bool = False,
+        drives: int = 4,
+        length: int = 60,
+        sensor: str = "small",
+        seed: int = 1,
+        picture_width: int = 0,
+        weather: str = "clear",
+        cache: str = "",
+        workers: int = 0,
+    ) -> None:
+        """Options.
+
+        split: train or val. task, sweeps, pose: as in `semantic_kitti`; task=semantics for the other one. drives,
+        length: see `TownDrives`. The others: see `TownDataset`.
+        """
+        root = self._settle_drives(
+            split, drives, length, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width,
+            weather=weather,
+        )  # fmt: skip
+        super().__init__(root=root, split=split, task=task, sweeps=sweeps, pose=pose)
+
+
+class TownOxford(TownDrives, OxfordDataset):
+    """Traversals of one circuit of a simulated town in the layout of Oxford Radar RobotCar, with poses and boxes.
+
+    Splits are `train`, and `val` and `test`, which are other traversals of the same circuit. Every second traversal
+    goes the other way; parked vehicles, traffic and light are others each time.
+    """
+
+    example: ClassVar[dict[str, object]] = {"drives": 2, "length": 2, "workers": 1}
+    layout = "oxford"
+    made: ClassVar[Mapping[str, str]] = {"train": "train", "val": "test", "test": "test"}
+
+    def __init__(
+        self,
+        *,
+        split: str = "train",
+        boxes: bool = True,
+        classes: tuple[str, ...] = ("Vehicle", "Pedestrian", "Cyclist"),
+        sweeps: int = 1,
+        pose: bool = False,
+        drives: int = 4,
+        length: int = 120,
+        stride: int = 8,
+        sensor: str = "small",
+        seed: int = 1,
+        weather: str = "clear",
+        cache: str = "",
+        workers: int = 0,
+    ) -> None:
+        """Options.
+
+        split: train, val or test. boxes, classes, sweeps, pose: as in `oxford`. drives, length, stride: see
+        `TownDrives`; the usual values go once round the circuit. The others: see `TownDataset`.
+        """
+        root = self._settle_drives(
+            split, drives, length, cache, workers, stride=stride, sensor=sensor, seed=seed, picture_width=0,
+            weather=weather,
+        )  # fmt: skip
+        super().__init__(root=root, split=split, boxes=boxes, classes=classes, sweeps=sweeps, pose=pose)

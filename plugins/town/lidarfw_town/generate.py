@@ -5,24 +5,27 @@ from __future__ import annotations
 import functools
 import json
 import math
-import multiprocessing
 import os
-import queue
-from collections.abc import Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.files import write_text
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from lidarfw_town.camera import kitti_camera
-from lidarfw_town.drive import WEATHER, Drive
+from lidarfw_town.drive import Drive
 from lidarfw_town.layouts import LAYOUTS, Layout, Place
+from lidarfw_town.light import WEATHER
 from lidarfw_town.sensors import LIDARS
 from lidarfw_town.version import VERSION
+from lidarfw_town.world import World
 
 _LEAD = 10  # steps before the first frame
 
@@ -31,9 +34,9 @@ _LEAD = 10  # steps before the first frame
 class Job:
     """What to write.
 
-    `layout`, `sensor` and `weather` are names; `split` is the list of ImageSets that the frames of the layout kitti
-    are named in; `length`: frames of one drive, 0 for the layout's own; `stride`: steps of 0.1 s between frames,
-    0 for the layout's own; `picture_width` in pixels, 0 for no pictures.
+    `layout`, `sensor` and `weather` are names; `split` is one of the dataset's; `length`: frames of one drive, 0 for
+    the layout's own; `stride`: steps of 0.1 s between frames, 0 for the layout's own; `picture_width` in pixels, 0 for
+    no pictures.
     """
 
     layout: str
@@ -53,14 +56,21 @@ class Job:
         for name, known in (("layout", LAYOUTS), ("sensor", LIDARS), ("weather", WEATHER)):
             if getattr(self, name) not in known:
                 raise ConfigError(f"{name}: expected one of {', '.join(known)}, found {getattr(self, name)!r}")
-        for name, least in (("frames", 1), ("seed", 0), ("length", 0), ("stride", 0), ("picture_width", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"{name}: expected {least} or more, found {getattr(self, name)}")
+        least = {"frames": 1, "seed": 0, "length": 0, "stride": 0, "picture_width": 0, "traversal": 0}
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise ConfigError(f"{name}: expected {value} or more, found {getattr(self, name)}")
+        LAYOUTS[self.layout].check(self.split, self.drives)
 
     @property
     def per_drive(self) -> int:
         """Frames of one drive."""
         return min(self.length or LAYOUTS[self.layout].length, self.frames)
+
+    @property
+    def drives(self) -> int:
+        """How many drives there are."""
+        return math.ceil(self.frames / self.per_drive)
 
     @property
     def step(self) -> int:
@@ -73,8 +83,7 @@ class Job:
 
     def writer(self) -> Layout:
         """The layout at its folder."""
-        camera = kitti_camera(self.picture_width) if self.picture_width else None
-        return LAYOUTS[self.layout](Path(self.root), camera, self.split)
+        return LAYOUTS[self.layout](Path(self.root), self.picture_width, self.split)
 
     def part(self, place: Place) -> Path:
         """The file that says that a frame is done, and holds what its layout keeps of it."""
@@ -87,18 +96,17 @@ class Job:
     def claim(self) -> None:
         """Note the settings in the folder; DataError where it holds frames of other settings."""
         wanted = {key: value for key, value in asdict(self).items() if key != "root"} | {"version": VERSION}
-        path = self._notes / "settings.json"
-        if not path.is_file():
-            write_text(path, json.dumps(wanted, indent=1) + "\n")
-            return
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if found != wanted:
-            other = ", ".join(
-                f"{key}: {found.get(key)} there, {wanted[key]} now" for key in wanted if found.get(key) != wanted[key]
-            )
-            raise DataError(
-                f"{self.root} holds a town of other settings ({other}).\n  fix: another folder, or delete it"
-            )
+        own = self._notes / "settings.json"
+        for path in sorted(Path(self.root).glob(".town/*/settings.json")):
+            free = () if path == own else ("split", "frames", "length")  # another split may be longer
+            found = json.loads(path.read_text(encoding="utf-8"))
+            other = [key for key in wanted if found.get(key) != wanted[key] and key not in free]
+            if other:
+                text = ", ".join(f"{key}: {found.get(key)} there, {wanted[key]} now" for key in other)
+                raise DataError(
+                    f"{self.root} holds a town of other settings ({text}).\n  fix: another folder, or delete it"
+                )
+        write_text(own, json.dumps(wanted, indent=1) + "\n")
 
     @property
     def complete(self) -> bool:
@@ -107,7 +115,7 @@ class Job:
 
     def finish(self) -> None:
         """Write what needs all frames, and note that everything stands."""
-        parts: list[list[dict[str, Any]]] = [[] for _ in range(math.ceil(self.frames / self.per_drive))]
+        parts: list[list[dict[str, Any]]] = [[] for _ in range(self.drives)]
         for place in self.places():
             parts[place.drive].append(json.loads(self.part(place).read_text(encoding="utf-8")))
         self.writer().finish(parts)
@@ -115,81 +123,104 @@ class Job:
 
 
 def generate(job: Job, workers: int = 1, *, quiet: bool = False) -> None:
-    """Write a whole set. Frames that stand already are kept; with more than one worker, processes are spawned."""
+    """Write a whole set with so many processes. Frames that stand already are kept.
+
+    Another process that writes into the same folder is waited for.
+    """
     job.check()
-    job.claim()
-    if job.complete:
-        return
-    missing = [place for place in job.places() if not job.part(place).is_file()]
-    columns = (TextColumn(f"{job.layout} {job.sensor}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=quiet) as progress:
+    folder = Path(job.root) / ".town"
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / "lock"):
+        job.claim()
+        if not job.complete:
+            _make(job, workers, quiet)
+            job.finish()
+
+
+def _make(job: Job, workers: int, quiet: bool) -> None:
+    _tidy(Path(job.root))
+    missing = _missing(job, job.places())
+    columns = (TextColumn(f"{job.layout} {job.split} {job.sensor}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeRemainingColumn(), disable=quiet, console=Console(stderr=True)) as progress:
         task = progress.add_task("frames", total=job.frames, completed=job.frames - len(missing))
         for _ in _made(job, missing, workers):
             progress.advance(task)
-    job.finish()
 
 
-def _made(job: Job, places: list[Place], workers: int) -> Iterator[Place]:
-    """Make the frames, and name each when it stands."""
+def _missing(job: Job, places: Sequence[Place]) -> list[Place]:
+    return [place for place in places if not job.part(place).is_file()]
+
+
+def _tidy(root: Path) -> None:
+    """Remove what a killed run left half-written, which loaders would take for scans."""
+    for path in root.rglob(".*"):
+        if re.fullmatch(r"\.[0-9a-f]{32}", path.stem):
+            path.unlink(missing_ok=True)
+
+
+def _made(job: Job, places: list[Place], workers: int) -> Iterator[None]:
+    """Make the frames, and yield whenever one stands."""
     if workers <= 1 or len(places) < 2:
         for place in places:
             make_frame(job, place)
-            yield place
+            yield
         return
+    read, write = os.pipe()
+    started = [_start(job, chunk, write) for chunk in _chunks(places, workers)]
+    os.close(write)
+    try:
+        with os.fdopen(read) as lines:
+            for _ in lines:  # one for a frame, until the last process has ended
+                yield
+    finally:
+        for process in started:
+            process.terminate()
+        codes = [process.wait() for process in started]
+    if any(codes):
+        raise DataError(f"a process that made frames ended with {next(filter(None, codes))}; it says why above")
+
+
+def _start(job: Job, places: Sequence[Place], output: int) -> subprocess.Popen[bytes]:
+    """A process of its own, so that scripts need no guard around their main part as multiprocessing does."""
     # numpy must not start threads of its own in every worker
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    done: Any = context.Queue()
-    with ProcessPoolExecutor(workers, context, _take_queue, (done,)) as pool:
-        futures = [pool.submit(_make_chunk, job, chunk) for chunk in _chunks(places, workers)]
-        for _ in places:
-            yield _next(done, futures)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    first, last = places[0].number, places[-1].number
+    words = [sys.executable, "-m", "lidarfw_town.generate", json.dumps(asdict(job)), str(first), str(last)]
+    return subprocess.Popen(words, stdout=output, env=environment)
 
 
-def _next(done: Any, futures: list[Future[None]]) -> Place:
-    while True:
-        try:
-            place: Place = done.get(timeout=1.0)
-            return place
-        except queue.Empty:
-            for future in futures:
-                if future.done():
-                    future.result()  # raises what went wrong there
+def _work(words: Sequence[str]) -> None:
+    """What a worker does: make the missing frames of a job from one number to another, and tell of each."""
+    job, first, last = Job(**json.loads(words[0])), int(words[1]), int(words[2])
+    for place in _missing(job, job.places()[first : last + 1]):
+        make_frame(job, place)
+        print(flush=True)
 
 
 def _chunks(places: list[Place], workers: int) -> list[list[Place]]:
-    """Frames of one drive together, since a worker builds its town once; as many as workers at least."""
-    drives: dict[int, list[Place]] = {}
-    for place in places:
-        drives.setdefault(place.drive, []).append(place)
-    parts = math.ceil(workers / len(drives))
-    return [drive[n::parts] for drive in drives.values() for n in range(parts) if drive[n::parts]]
+    """The frames of a worker each: one after another, so that it builds few towns, and equally many."""
+    size = math.ceil(len(places) / workers)
+    return [places[start : start + size] for start in range(0, len(places), size)]
 
 
-_queue: Any = None
-
-
-def _take_queue(done: Any) -> None:
-    global _queue
-    _queue = done
-
-
-def _make_chunk(job: Job, places: list[Place]) -> None:
-    for place in places:
-        make_frame(job, place)
-        _queue.put(place)
+@functools.lru_cache(maxsize=1)
+def _world(seed: int) -> World:
+    return World(seed)
 
 
 @functools.lru_cache(maxsize=1)
 def drive_of(job: Job, number: int) -> Drive:
     """The drive of that number of a set."""
-    # towns of the splits and of neighbouring seeds differ
-    seed = job.seed * 1000 + number + (500 if job.split != "train" else 0)
-    steps = _LEAD + job.per_drive * job.step
     layout = LAYOUTS[job.layout]
+    seed, traversal = job.seed * 1000, job.traversal
+    if layout.one_town:
+        traversal += layout.traversal(job.split, number)
+    else:  # the towns of the splits and of neighbouring seeds differ
+        seed += number + (500 if job.split != "train" else 0)
     return Drive(
-        seed, steps, LIDARS[job.sensor], traversal=job.traversal, compensated=layout.compensated, weather=job.weather
-    )
+        seed, _LEAD + job.per_drive * job.step, LIDARS[job.sensor], traversal=traversal, weather=job.weather,
+        compensated=layout.compensated, circuit=layout.one_town, world=_world(seed),
+    )  # fmt: skip
 
 
 def make_frame(job: Job, place: Place) -> None:
@@ -198,3 +229,7 @@ def make_frame(job: Job, place: Place) -> None:
     frame = drive.frame(_LEAD + place.index * job.step)
     part = job.writer().write(frame, drive, place)
     write_text(job.part(place), json.dumps(part))
+
+
+if __name__ == "__main__":
+    _work(sys.argv[1:])

@@ -1,0 +1,17 @@
+"""The official layouts of public datasets, written from drives through the town."""
+
+from __future__ import annotations
+
+from lidarfw_town.layouts.base import Layout, Place
+from lidarfw_town.layouts.kitti import KittiLayout, KittiTrackingLayout, labels_of
+from lidarfw_town.layouts.oxford import OxfordLayout
+from lidarfw_town.layouts.semantic_kitti import SemanticKittiLayout
+
+LAYOUTS: dict[str, type[Layout]] = {
+    "kitti": KittiLayout,
+    "semantic_kitti": SemanticKittiLayout,
+    "kitti_tracking": KittiTrackingLayout,
+    "oxford": OxfordLayout,
+}
+
+__all__ = ["LAYOUTS", "Layout", "Place", "labels_of"]
