@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
-
 from lidarfw.components.layers import BatchNorm1d, grid_from_options
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Backbone
@@ -26,6 +24,7 @@ from lidarfw.ops import (
 )
 from lidarfw.ops.cells import cell_columns, cell_index, cell_key
 from lidarfw.types import BEV, Grid, Points, Spec, Voxels
+from torch import Tensor, nn
 
 
 @dataclass
@@ -53,8 +52,8 @@ def _halved(fine: _Counted) -> _Counted:
     z, y, x = (2 * stride for stride in voxels.strides)
     shape = voxels.grid.shape((z, y, x))
     b, *cell = voxels.index.unbind(1)
-    halves = (b, *(column // 2 for column in cell))
-    keys, inverse = torch.unique(cell_key(halves, shape), return_inverse=True)  # type: ignore[no-untyped-call]
+    key = cell_key((b, cell[0] // 2, cell[1] // 2, cell[2] // 2), shape)
+    keys, inverse = torch.unique(key, return_inverse=True)
     points = scatter_sum(fine.points, inverse, len(keys))
     mean = scatter_sum(voxels.features * fine.points, inverse, len(keys)) / points
     index = cell_index(cell_columns(keys, shape))

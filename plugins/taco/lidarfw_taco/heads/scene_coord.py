@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
-
 from lidarfw.components.layers import BatchNorm1d
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Head
 from lidarfw.ops import find_voxels, scatter_mean, to_dense, transform
 from lidarfw.types import BEV, Points, Poses, Record, SceneCoords, Spec, Targets, Voxels
+from torch import Tensor, nn
 
 TARGETS = ("absolute", "shift")
 CALIBRATION = 100  # training batches that set origin and scale

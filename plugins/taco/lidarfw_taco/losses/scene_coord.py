@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import torch
-from lidarfw_taco.heads.scene_coord import SceneCoordOutput
-from torch import Tensor
-
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Loss
 from lidarfw.ops import points_in_boxes, transform
 from lidarfw.types import Boxes, Poses, SceneCoords, Spec, Targets
+from torch import Tensor
+
+from lidarfw_taco.heads.scene_coord import SceneCoordOutput
 
 
 class SceneCoordLoss(Loss):

@@ -6,12 +6,11 @@ Source: Yang et al., "LiSA: LiDAR Localization with Semantic Awareness", CVPR 20
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
-
 from lidarfw.components.layers import BatchNorm1d
 from lidarfw.interfaces import Neck
 from lidarfw.ops import find_voxels, scatter_mean
 from lidarfw.types import Spec, Voxels
+from torch import Tensor, nn
 
 
 class _Gate(nn.Module):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-
 from lidarfw.interfaces import PostProcessor
 from lidarfw.ops import points_in_boxes
 from lidarfw.types import Boxes, SceneCoords, Spec
