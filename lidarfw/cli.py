@@ -1,4 +1,4 @@
-"""The command line: `lidarfw train|eval|predict|track|list|show|check|new|prepare|bench|completion`."""
+"""The command line: `lidarfw train|eval|predict|track|list|show|check|new|prepare|bench|claims|completion`."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ COMMANDS = {
     "new": "write a plugin distribution to start from",
     "prepare": "make a dataset ready: indices, databases, generated data",
     "bench": "time a model's components, or the ops",
+    "claims": "test what a method is said to gain: runs, intervals, verdicts",
     "completion": "print the shell code that completes names with <TAB>",
 }
 _EXAMPLES = """examples:

@@ -53,8 +53,8 @@ def _refuse(key: str, line: str) -> None:
     if root in LEARNED_KEYS:
         raise ConfigError(
             f"{line}: {root} is part of the model, and the model comes from the checkpoint with its weights.\n"
-            "  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed, and what comes after "
-            "the heads: postprocessor, filter, tracker, retriever\n"
+            "  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed; and what comes\n"
+            "  after the heads: postprocessor, filter, tracker, retriever\n"
             f"  fix: train with {line}"
         )
     if root in TRAINING_KEYS:

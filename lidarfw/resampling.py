@@ -111,9 +111,9 @@ def blocks(frames: Sequence[FrameMeta], length: int) -> list[list[int]]:
     return found
 
 
-def draws(size: int, count: int) -> npt.NDArray[np.int64]:
-    """(count, size) numbers below `size`, drawn with replacement; the same in every call."""
-    generator = np.random.default_rng((size, count))
+def draws(size: int, count: int, stream: int = 0) -> npt.NDArray[np.int64]:
+    """(count, size) numbers below `size`, drawn with replacement; the same in every call, others in each `stream`."""
+    generator = np.random.default_rng((size, count, stream))
     return generator.integers(max(size, 1), size=(count, size))
 
 
