@@ -8,8 +8,11 @@ from lidarfw._lazy import lazy_attributes
 
 if TYPE_CHECKING:
     from lidarfw.checkpoint import load
+    from lidarfw.merging import merge
     from lidarfw.streaming import Stream
 
 __version__ = "0.1.0"
-__getattr__ = lazy_attributes(__name__, {"load": "lidarfw.checkpoint", "Stream": "lidarfw.streaming"})
-__all__ = ["Stream", "__version__", "load"]
+__getattr__ = lazy_attributes(
+    __name__, {"load": "lidarfw.checkpoint", "merge": "lidarfw.merging", "Stream": "lidarfw.streaming"}
+)
+__all__ = ["Stream", "__version__", "load", "merge"]

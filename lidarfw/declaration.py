@@ -26,7 +26,7 @@ from lidarfw.types import VOCABULARY, FrameMeta, FrameResult, Stride, Sweeps, Ta
 
 REQUIRED: Any = inspect.Parameter.empty
 _ENTRANCE = {"filter": "step", "tracker": "step", "metric": "update", "retriever": "build"}  # else forward
-_SPECIAL = ("targets", "meta")
+_SPECIAL = ("targets", "meta", "progress")
 _REAL_MODULES = ("typing", "typing_extensions", "collections.abc", "math", "lidarfw.types")
 
 
@@ -77,7 +77,7 @@ class Declaration:
     specs: tuple[str, ...]  # positional parameters of __init__
     options: dict[str, Option]
     takes: tuple[Parameter, ...]
-    special: tuple[str, ...]  # which of targets, meta it takes
+    special: tuple[str, ...]  # which of targets, meta, progress it takes
     gives: tuple[tuple[type, bool], ...]  # (kind, several levels?), in the order in which they are returned
     output: str = ""  # path of the class that a head's forward returns
     defaults: dict[str, list[str]] = field(default_factory=dict)

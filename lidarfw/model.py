@@ -52,7 +52,7 @@ class PerceptionModel(nn.Module):
         for step in self.plan.of("loss"):
             weight = step.weight * (min(1.0, progress / step.ramp) if step.ramp > 0 else 1.0)
             if weight != 0:
-                found = self._call(step, step.declared.takes, outputs, batch)
+                found = self._call(step, step.declared.takes, outputs, batch, progress)
                 terms[step.name] = {name: weight * term for name, term in found.items()}
         return terms
 
@@ -82,17 +82,26 @@ class PerceptionModel(nn.Module):
 
     # wiring at run time
 
-    def _call(self, step: Step, parameters: Iterable[Parameter], outputs: dict[str, Any], batch: Batch) -> Any:
+    def _call(
+        self,
+        step: Step,
+        parameters: Iterable[Parameter],
+        outputs: dict[str, Any],
+        batch: Batch,
+        progress: float = 1.0,
+    ) -> Any:
         arguments = {p.name: self._argument(step, p, outputs) for p in parameters}
-        return self.component(step)(**arguments, **self._special(step, batch))
+        return self.component(step)(**arguments, **self._special(step, batch, progress))
 
-    def _special(self, step: Step, batch: Batch) -> dict[str, Any]:
-        """`targets` (losses always, other components in training only) and `meta`, where asked for."""
+    def _special(self, step: Step, batch: Batch, progress: float = 1.0) -> dict[str, Any]:
+        """`targets` (losses always, other components in training only), `meta` and `progress`, where asked for."""
         special: dict[str, Any] = {}
         if "targets" in step.declared.special:
             special["targets"] = batch.targets if self.training or step.slot == "loss" else None
         if "meta" in step.declared.special:
             special["meta"] = batch.meta
+        if "progress" in step.declared.special:
+            special["progress"] = progress
         return special
 
     def _argument(

@@ -50,6 +50,7 @@ class Transform(ABC):
 
     example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
     train_only: bool = False  # augmentations are left out in evaluation and prediction
+    follows: ClassVar[tuple[str, ...]] = ()  # transforms that must come before it; it may then count on past scans
 
     @abstractmethod
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:

@@ -2,8 +2,9 @@
 
 The parameters of `forward` (of `step` for Filter and Tracker, `update` for Metric) say what a component
 needs; `__init__` gets their Specs under the same names, positionally, and its keyword-only arguments are the
-config; `self.provides` says what comes out. Two parameter names are special: `targets: Targets` and
-`meta: list[FrameMeta]` come from the batch. `__init__` may also ask for `data: DataSpec`.
+config; `self.provides` says what comes out. Three parameter names are special: `targets: Targets` and
+`meta: list[FrameMeta]` come from the batch, and a loss may ask for `progress: float`, the share of the training that
+is done (0..1). `__init__` may also ask for `data: DataSpec`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -42,17 +42,26 @@ def range_project(points: Points, view: RangeView) -> RangeImage:
     return RangeImage(image[:, 3:], image[:, :3], mask.view(shape), pixel, view)
 
 
-def residual_images(current: RangeImage, past: Sequence[Points]) -> Tensor:
+def residual_images(
+    current: RangeImage,
+    past: Sequence[Points],
+    *,
+    nearest: float = 0.0,
+    farthest: float = float("inf"),
+    signed: bool = False,
+) -> Tensor:
     """(B, len(past), H, W) relative change of range `abs(r - r_past) / r`; 0 where a pixel has no point in one of both.
 
     Chen et al., "Moving Object Segmentation in 3D LiDAR Data" (RA-L 2021), equation 1. The past scans stand in
-    the current sensor frame already.
+    the current sensor frame already. Only ranges between `nearest` and `farthest` metres count, on both sides.
+    `signed` gives `(r_past - r) / r`: positive where something has come in front of what was seen before.
     """
-    now = current.xyz.norm(dim=1)
+    now = current.xyz.norm(dim=1)[:, None]
     before = torch.stack([_nearest_range(points, current.view) for points in past], 1)
     both = current.mask[:, None] & torch.isfinite(before)
-    change = (now[:, None] - before).abs() / now[:, None].clamp(min=1e-6)
-    return torch.where(both, change, 0)
+    both &= (now > nearest) & (now < farthest) & (before > nearest) & (before < farthest)
+    change = (before - now) / now.clamp(min=1e-6)
+    return torch.where(both, change if signed else change.abs(), 0)
 
 
 def _nearest_range(points: Points, view: RangeView) -> Tensor:
@@ -88,24 +97,86 @@ def range_knn(
         cutoff: metres.
         sigma: of the weight 1 - gaussian(pixel offset), in pixels.
     """
-    if window not in range(1, 16, 2):
-        raise ValueError(f"range_knn: window must be odd and at most 15, got {window}")
-    margin, width = window // 2, labels.shape[2] + window // 2 * 2
-    ranges = _surround(torch.where(image.mask, image.xyz.norm(dim=1), torch.inf), margin, torch.inf).flatten()
-    votes = _surround(labels, margin, 0).flatten()
-    line = torch.arange(window, dtype=torch.int32, device=labels.device)
-    offsets = (line[:, None] * width + line).flatten()
-    weights = (1 - _gaussian(window, sigma, distance)).tolist()
-    weights[window * window // 2] = 0.0  # the point itself counts as lying in its pixel
     result = torch.full_like(image.pixel, -1)
-    inside = (image.pixel >= 0).nonzero().squeeze(1)
-    corners = _corners(image.pixel[inside], labels.shape[1], labels.shape[2], margin)
-    for rows, corner in zip(inside.split(_CHUNK), corners.split(_CHUNK), strict=True):  # type: ignore[no-untyped-call]
-        near, apart = _nearest(ranges, corner, offsets.tolist(), distance[rows], weights, neighbors)
-        place = corner + offsets[near]
+    votes = _surround(labels, window // 2, 0).flatten()
+    for rows, place, apart in _neighbors(image, distance, window, neighbors, sigma):
         found = votes.index_select(0, place.view(-1)).view(place.shape)
         result.index_copy_(0, rows, _majority(found, apart <= cutoff))
     return result
+
+
+def range_knn_mean(
+    image: RangeImage,
+    values: Tensor,
+    distance: Tensor,
+    *,
+    window: int = 5,
+    neighbors: int = 5,
+    cutoff: float = 1.0,
+    sigma: float = 1.0,
+) -> Tensor:
+    """Mean (N, C) of the values (B, C, H, W) of the pixels that `range_knn` lets vote on each point.
+
+    Probabilities of classes stay probabilities. The pixel of the point itself always counts; points outside the view
+    get 0. Arguments as of `range_knn`.
+    """
+    margin = window // 2
+    table = _surround(values.movedim(1, 0), margin, 0.0).flatten(1)  # (C, pixels)
+    result = values.new_zeros(len(image.pixel), values.shape[1])
+    for rows, place, apart in _neighbors(image, distance, window, neighbors, sigma):
+        near = (apart <= cutoff).to(values.dtype)
+        total = near.sum(0)
+        means = [(row.index_select(0, place.view(-1)).view(place.shape) * near).sum(0) / total for row in table]
+        result.index_copy_(0, rows, torch.stack(means, 1))
+    return result
+
+
+def range_match(image: RangeImage, xyz: Tensor, reach: float, *, window: int = 5) -> Tensor:
+    """Flat pixel (N,) int64 of `image` whose range is nearest to that of each point (N, 3) of one sample, -1 for none.
+
+    Searched is the window round the pixel that the point falls into, going round the left and right border; of
+    equally near ranges the pixel nearest to the middle wins. Ranges more than `reach` metres apart do not match.
+    """
+    view = image.view
+    pixel, distance = _project(Points.from_scan(xyz, xyz[:, :0]), view)
+    asked = RangeImage(image.features, image.xyz, image.mask, pixel, view)
+    result = torch.full_like(pixel, -1)
+    margin, width = window // 2, view.width + window // 2 * 2
+    for rows, place, apart in _neighbors(asked, distance, window, 1, 0.0):
+        row, column = torch.div(place[0], width, rounding_mode="floor") - margin, place[0] % width - margin
+        flat = row * view.width + column % view.width
+        result.index_copy_(0, rows, torch.where(apart[0] <= reach, flat, -1).long())
+    return result
+
+
+def _neighbors(
+    image: RangeImage, distance: Tensor, window: int, count: int, sigma: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """In chunks of points inside the view: their rows (n,), and of the `count` pixels of the window nearest in range
+    their places (count, n) in the surrounded picture and weighted distances (count, n), inf for empty ones.
+
+    With `sigma` 0 distances in the picture have no weight and the pixel of the point is one like the others.
+    """
+    if window not in range(1, 16, 2):
+        raise ValueError(f"range_knn: window must be odd and at most 15, got {window}")
+    _, height, columns = image.mask.shape
+    margin, width = window // 2, columns + window // 2 * 2
+    ranges = _surround(torch.where(image.mask, image.xyz.norm(dim=1), torch.inf), margin, torch.inf).flatten()
+    line = torch.arange(window, dtype=torch.int32, device=ranges.device)
+    offsets = (line[:, None] * width + line).flatten()
+    weights = [1.0] * window**2
+    if sigma:
+        weights = (1 - _gaussian(window, sigma, distance)).tolist()
+        weights[window * window // 2] = 0.0  # the point itself counts as lying in its pixel
+    else:
+        middle = line - margin
+        order = (middle[:, None] ** 2 + middle**2).flatten().argsort(stable=True)
+        offsets = offsets[order]
+    inside = (image.pixel >= 0).nonzero().squeeze(1)
+    corners = _corners(image.pixel[inside], height, columns, margin)
+    for rows, corner in zip(inside.split(_CHUNK), corners.split(_CHUNK), strict=True):  # type: ignore[no-untyped-call]
+        near, apart = _nearest(ranges, corner, offsets.tolist(), distance[rows], weights, count)
+        yield rows, corner + offsets[near], apart
 
 
 def _corners(pixel: Tensor, height: int, width: int, margin: int) -> Tensor:

@@ -42,6 +42,7 @@ class Targets(Record):
     points: PointLabels | None = None
     poses: Poses | None = None
     tracks: Tracks | None = None
+    pixels: RangeImage | None = None  # what a loss learns from at the pixels of a range image: distance maps, say
 
     def of(self, kind: type) -> Any:
         """The target of a kind (`Boxes`, `PointLabels`, `Poses`, `Tracks`), or None."""

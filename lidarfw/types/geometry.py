@@ -89,6 +89,7 @@ class RangeView:
     width: int
     up: float  # elevation of the upper edge of row 0
     down: float  # elevation of the lower edge of the last row
+    clip: bool = False  # points above the first or below the last row count to that row; else they are outside
 
     def __post_init__(self) -> None:
         if self.height < 1 or self.width < 1:
@@ -101,14 +102,15 @@ class RangeView:
     def project(self, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Pixel of points (N, 3): row (N,) int64, column (N,) int64, range (N,) metres, inside (N,) bool.
 
-        Inside is False above `up`, at or below `down`, at the origin and where xyz is not finite; row and column
-        are 0 there.
+        Inside is False above `up` and at or below `down` (unless `clip`), at the origin and where xyz is not finite;
+        row and column are 0 there.
         """
         x, y, z = (axis.contiguous() for axis in xyz.unbind(1))  # several times as fast as strided columns
         flat = x * x + y * y
         distance = torch.sqrt(flat + z * z)
         elevation, azimuth = torch.atan2(z, torch.sqrt(flat)), torch.atan2(y, x)
         row = torch.floor((self.up - elevation) / (self.up - self.down) * self.height)
+        row = row.clamp(0, self.height - 1) if self.clip else row
         column = torch.floor((1 - azimuth / math.pi) * (self.width / 2)) % self.width
         inside = (row >= 0) & (row < self.height) & (distance > 0) & torch.isfinite(distance)
         return torch.where(inside, row, 0).long(), torch.where(inside, column, 0).long(), distance, inside

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 
+from lidarfw import registry
 from lidarfw.errors import ConfigError, DataError
+from lidarfw.interfaces import Transform
 from lidarfw.testing.checks.compare import copied, difference
 from lidarfw.testing.checks.subject import FailedError, SkippedError, Subject, check, require
 from lidarfw.testing.synthetic import SyntheticDataset
@@ -117,8 +120,25 @@ def _input_mismatch(spec: Spec, value: Any) -> str:
 # transforms
 
 
+class _Prepared(SyntheticDataset):
+    """Synthetic frames behind the transforms that the one under test follows."""
+
+    def __init__(self, before: Sequence[Transform]) -> None:
+        super().__init__(frames=len(SEEDS), points=4096, sweeps=3 if before else 1)
+        self.before = before
+        for transform in before:
+            self.spec = transform.spec(self.spec)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = super().__getitem__(index)
+        for transform in self.before:
+            frame = transform(frame, np.random.default_rng(index))
+        return frame
+
+
 def _attached(subject: Subject) -> tuple[Any, SyntheticDataset]:
-    dataset, transform = SyntheticDataset(frames=len(SEEDS), points=4096), _make(subject)
+    transform = _make(subject)
+    dataset = _Prepared([registry.load("transform", name)() for name in transform.follows])
     try:
         transform.attach(dataset)
     except (DataError, ConfigError) as error:

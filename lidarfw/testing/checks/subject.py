@@ -110,6 +110,8 @@ class Built:
             found["targets"] = examples.targets(frames) if training or self.subject.slot == "loss" else None
         if "meta" in declared.special:
             found["meta"] = [frame.meta for frame in frames]
+        if "progress" in declared.special:
+            found["progress"] = 0.5
         return found
 
     def _argument(self, p: Parameter, frames: Sequence[Any], training: bool) -> Any:
