@@ -446,7 +446,8 @@ def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecor
 
     The model comes from the checkpoint; dataset, transforms, metric, loader, splits and trainer from its config too,
     changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`). `record`
-    is filled with what every frame adds to the metrics; it needs an evaluation in one process. Raises ConfigError for an override of the model, CheckpointError where the data is not what the model learned.
+    is filled with what every frame adds to the metrics; it needs an evaluation in one process. Raises ConfigError for
+    an override of what was learned, CheckpointError where the data is not what the model learned.
     """
     from lidarfw.assembly import build, plan
 

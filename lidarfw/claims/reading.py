@@ -95,8 +95,12 @@ def read(path: Path, extra: Sequence[str] = ()) -> ClaimsFile:
     """The claims of a file, `extra` overrides added to every run; ConfigError naming file, key and what is wrong."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or str(error)
+        place = f"line {mark.line + 1}: " if mark else ""
+        raise ConfigError(f"{path} cannot be read: {place}{problem}") from error
     node = _mapping(content, str(path), _FILE_KEYS, ("runs", "claims"))
     runs = {name: _run(f"{path}: runs.{name}", name, value, node, extra) for name, value in _items(node, path, "runs")}
     seeds = _seeds(node.get("seeds", [1, 2, 3]), f"{path}: seeds")

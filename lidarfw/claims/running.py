@@ -220,9 +220,10 @@ class Runner:
         threads: int = 1,
         minutes: float | None = None,
         launcher: str | None = None,
-        start: Start = start_process,
+        start: Start | None = None,
     ) -> None:
-        self.work, self.jobs, self.threads, self.launcher, self.start = work, jobs, threads, launcher, start
+        self.work, self.jobs, self.threads, self.launcher = work, jobs, threads, launcher
+        self.start = start or start_process
         self.deadline = time.monotonic() + 60 * minutes if minutes is not None else None
         self.failed: dict[Path, str] = {}  # folder -> why
         self.busy: list[Job] = []  # another runner is at them
@@ -363,7 +364,7 @@ def _note_trained(job: Job) -> None:
 
 def _last_words(log: Path, code: int) -> str:
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    return f"exit code {code}: " + " | ".join(lines[-3:]) + f"\n    log: {log}"
+    return "\n    ".join([f"exit code {code}, the end of {log}:", *lines[-6:]])
 
 
 def _lock(folder: Path) -> TextIO | None:
