@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+import numpy as np
 from lidarfw.components.datasets.drives import DriveDataset
 from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
+from lidarfw.components.datasets.nuscenes import NuScenesDataset
 from lidarfw.components.datasets.oxford import OxfordDataset
 from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.errors import DataError
 from lidarfw.interfaces.data import Dataset
+from lidarfw.nuscenes import CLASSES
+from lidarfw.types import Camera, DataSpec, Frame, Image, Spec
 
 from lidarfw_town.version import VERSION
 
@@ -69,15 +76,16 @@ class TownDataset(Dataset):
 
 class TownDrives(TownDataset, DriveDataset):
     """Datasets of whole drives. Options that all have: `drives` of training, and of each the frames `length`, which
-    are `stride` steps of 0.1 s apart. There are half as many of the other split, one at least.
+    are `stride` steps of 0.1 s apart. There are half as many of the other split, one at least and `most` at most.
     """
+
+    most: ClassVar[int]  # drives that the loader knows in the split that is not for training
 
     def _settle_drives(
         self, split: str, drives: int, length: int, cache: str, workers: int, **settings: str | int
     ) -> str:
         held_out = next(name for name in self.made.values() if name != "train")
-        most = max(len(self.splits[name]) for name, files in self.made.items() if files == held_out)
-        self._drives = {"train": drives, held_out: min(max(drives // 2, 1), most)}
+        self._drives = {"train": drives, held_out: min(max(drives // 2, 1), self.most)}
         frames = {name: count * length for name, count in self._drives.items()}
         return self._settle(split, frames, cache, workers, length=length, **settings)
 
@@ -130,7 +138,7 @@ class TownTracking(TownDrives, KittiTrackingDataset):
     """
 
     example: ClassVar[dict[str, object]] = {"drives": 1, "length": 3, "workers": 1}
-    layout = "kitti_tracking"
+    layout, most = "kitti_tracking", 11
 
     def __init__(
         self,
@@ -171,7 +179,7 @@ class TownMos(TownDrives, SemanticKittiDataset):
     """
 
     example: ClassVar[dict[str, object]] = {"drives": 1, "length": 3, "workers": 1}
-    layout = "semantic_kitti"
+    layout, most = "semantic_kitti", 1
 
     def __init__(
         self,
@@ -209,7 +217,7 @@ class TownOxford(TownDrives, OxfordDataset):
     """
 
     example: ClassVar[dict[str, object]] = {"drives": 2, "length": 2, "workers": 1}
-    layout = "oxford"
+    layout, most = "oxford", 4
     made: ClassVar[Mapping[str, str]] = {"train": "train", "val": "test", "test": "test"}
 
     def __init__(
@@ -239,3 +247,121 @@ class TownOxford(TownDrives, OxfordDataset):
             weather=weather,
         )  # fmt: skip
         super().__init__(root=root, split=split, boxes=boxes, classes=classes, sweeps=sweeps, pose=pose)
+
+
+class Town360(TownDrives, Kitti360Dataset):
+    """Traversals of one circuit of a simulated town in the layout of KITTI-360: scans, two fisheyes, poses.
+
+    Splits are `train`, and `val` and `test`, which are other traversals of the same circuit. Every second traversal
+    goes the other way; parked vehicles, traffic and light are others each time. The truth of a camera CAMERA may be
+    given as inputs of one channel: CAMERA_depth in metres (0 where nothing is; z of a perspective picture, the
+    distance from a fisheye) and CAMERA_semantics, the ids of KITTI-360.
+    """
+
+    example: ClassVar[dict[str, object]] = {
+        "drives": 1, "length": 2, "picture_width": 100, "images": ("image_02",), "depth": True, "workers": 1,
+    }  # fmt: skip
+    layout, most = "kitti_360", 2
+    made: ClassVar[Mapping[str, str]] = {"train": "train", "val": "test", "test": "test"}
+
+    def __init__(
+        self,
+        *,
+        split: str = "train",
+        images: tuple[str, ...] = ("image_02", "image_03"),
+        image_scale: float = 1.0,
+        depth: bool = False,
+        semantics: bool = False,
+        sweeps: int = 1,
+        pose: bool = False,
+        drives: int = 2,
+        length: int = 120,
+        stride: int = 8,
+        sensor: str = "small",
+        seed: int = 1,
+        picture_width: int = 350,
+        weather: str = "clear",
+        cache: str = "",
+        workers: int = 0,
+    ) -> None:
+        """Options.
+
+        split: train, val or test. images, image_scale, sweeps, pose: as in `kitti_360`. depth, semantics: also give
+        the truth of the images. drives, length, stride: see `TownDrives`; the usual values go once round the circuit.
+        picture_width: of the fisheyes. The others: see `TownDataset`.
+        """
+        root = self._settle_drives(
+            split, drives, length, cache, workers, stride=stride, sensor=sensor, seed=seed,
+            picture_width=picture_width, weather=weather,
+        )  # fmt: skip
+        super().__init__(root=root, split=split, images=images, image_scale=image_scale, sweeps=sweeps, pose=pose)
+        self._truth = [kind for kind, wanted in (("depth", depth), ("semantics", semantics)) if wanted]
+        self.spec = self._sized(picture_width)
+
+    def _sized(self, width: int) -> DataSpec:
+        """The spec with the cameras of the town, and with the truth of their pictures."""
+        from lidarfw_town.layouts.kitti_360 import rig  # imports the ray caster
+
+        cameras = {name: rig(width)[name].scaled(self.image_scale) for name in self.images}
+        inputs = {name: replace(spec, geometry=cameras.get(name)) for name, spec in self.spec.inputs.items()}
+        for name, kind in itertools.product(self.images, self._truth):
+            inputs[f"{name}_{kind}"] = Spec(Image, channels=1, geometry=cameras[name])
+        return replace(self.spec, inputs=inputs)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame, (drive, place) = super().__getitem__(index), self.find(index)
+        folders = {"depth": "data_2d_depth/{}/{}", "semantics": "data_2d_semantics/train/{}/{}/semantic"}
+        for name, kind in itertools.product(self.images, self._truth):
+            path = Path(self.root) / folders[kind].format(drive.name, name) / f"{drive.scans[place].stem}.png"
+            frame.inputs[f"{name}_{kind}"] = _values(path, frame.inputs[name].cameras[0], 256 if kind == "depth" else 1)
+        return frame
+
+
+def _values(path: Path, camera: Camera, units: int) -> Image:
+    """A picture of one number a pixel, as large as the camera's; of several pixels the one in the middle is taken."""
+    import cv2
+    import torch
+
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is None:
+        raise DataError(f"{path}: cannot be read as a picture.\n  fix: delete the folder, it is made again")
+    sized = cv2.resize(stored, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
+    return Image(torch.tensor(sized.astype(np.float32) / units)[None, None], (camera,))
+
+
+class TownNuScenes(TownDrives, NuScenesDataset):
+    """Scenes of simulated towns in the layout of nuScenes: boxes with velocities and identities, and past scans.
+
+    Splits are `train` and `val`, every scene in another town. There are ten scans a second, and two key frames.
+    """
+
+    example: ClassVar[dict[str, object]] = {"drives": 1, "length": 6, "sensor": "small", "workers": 1}
+    layout, most = "nuscenes", 12
+
+    def __init__(
+        self,
+        *,
+        split: str = "train",
+        classes: tuple[str, ...] = CLASSES,
+        sweeps: int = 5,
+        pose: bool = False,
+        drives: int = 4,
+        length: int = 100,
+        sensor: str = "hdl32",
+        seed: int = 1,
+        picture_width: int = 0,
+        weather: str = "clear",
+        cache: str = "",
+        workers: int = 0,
+    ) -> None:
+        """Options.
+
+        split: train or val. classes, sweeps, pose: as in `nuscenes`; sweeps=5 is the half second that ten scans are
+        there. drives, length: see `TownDrives`; length counts scans, of which every fifth is a frame. picture_width:
+        of the six pictures of a key frame. The others: see `TownDataset`.
+        """
+        root = self._settle_drives(
+            split, drives, length, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width,
+            weather=weather,
+        )  # fmt: skip
+        super().__init__(root=root, split=split, classes=classes, sweeps=sweeps, pose=pose)

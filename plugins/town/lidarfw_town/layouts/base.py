@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 from lidarfw.errors import ConfigError
 from lidarfw.files import atomic_path
 
@@ -15,6 +16,7 @@ from lidarfw_town.drive import Drive, TownFrame
 from lidarfw_town.mesh import Array
 
 FEWEST = 3  # points below which an object is not labelled
+TO_NED = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # east, north, up -> north, east, down
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,7 @@ class Layout:
         """Write the files of whole drives, from what `write` gave for their frames, drive by drive."""
 
 
-def write_array(path: Path, values: Array | np.ndarray, kind: str = "<f4") -> None:
+def write_array(path: Path, values: Array | np.ndarray, kind: npt.DTypeLike = "<f4") -> None:
     """Values as little-endian numbers, row by row."""
     with atomic_path(path) as temporary:
         np.asarray(values).astype(kind).tofile(temporary)
@@ -98,6 +100,19 @@ def numbers(matrix: Array | Sequence[float]) -> str:
 def square(matrix: Array) -> Array:
     """A transform (3, 4) as (4, 4)."""
     return np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+
+
+def angles(pose: Array) -> list[float]:
+    """Roll, pitch, yaw in radians of a transform (4, 4): Rz(yaw) Ry(pitch) Rx(roll)."""
+    from scipy.spatial.transform import Rotation
+
+    yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX").tolist()
+    return [roll, pitch, yaw]
+
+
+def rings(frame: TownFrame) -> np.ndarray:
+    """The beam (N,) of every point, the lowest one 0."""
+    return np.asarray(len(frame.grid) - 1 - np.nonzero(frame.grid > 0.5)[0])  # a drive leaves out what is nearer
 
 
 def box_lines(frame: TownFrame, names: Mapping[str, str]) -> str:

@@ -11,16 +11,14 @@ import numpy as np
 from lidarfw.components.datasets.drives import from_angles, inverse
 from lidarfw.components.datasets.oxford import OxfordDataset
 from lidarfw.files import write_text
-from scipy.spatial.transform import Rotation
 
 from lidarfw_town.drive import Drive, TownFrame
-from lidarfw_town.layouts.base import Layout, Place, box_lines, write_array
+from lidarfw_town.layouts.base import TO_NED, Layout, Place, angles, box_lines, write_array
 from lidarfw_town.mesh import Array
 
 _NAMES = dict.fromkeys(("car", "van", "truck", "bus"), "Vehicle")
 _NAMES |= {"cyclist": "Cyclist", "motorcyclist": "Cyclist", "pedestrian": "Pedestrian"}
 _TO_VELODYNE = np.diag([-1.0, 1, -1, 1])  # x ahead, y left, z up -> x back, y left, z down
-_TO_MAP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # east, north, up -> north, east, down
 _ORIGIN = (5_735_000.0, 620_000.0, 0.0)  # northing, easting, down of the town's origin
 # on the vehicle (x ahead, y right, z down): x y z roll pitch yaw
 _MOUNTED = {"velodyne_left": (-0.60, -0.34, -0.27, 0.0, 0.0, np.pi), "ins": (-1.71, 0.12, 1.19, 0.0, 0.0, 0.0)}
@@ -72,13 +70,13 @@ def inertial_poses(poses: Array) -> Array:
     """Poses (F, 4, 4) of the inertial unit in northing, easting, down, of those of the LiDAR in the world."""
     vehicle = {name: from_angles(np.array([mount]))[0] for name, mount in _MOUNTED.items()}
     from_inertial = inverse(_TO_VELODYNE) @ inverse(vehicle["velodyne_left"]) @ vehicle["ins"]
-    found = _TO_MAP @ poses @ from_inertial
+    found = TO_NED @ poses @ from_inertial
     found[:, :3, 3] += _ORIGIN
     return np.asarray(found)
 
 
 def _ins_row(pose: Array) -> str:
     """The values of a row after its time; what no loader needs is constant."""
-    yaw, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZYX")
     place = ",".join(f"{value:.6f}" for value in pose[:3, 3])
-    return f"INS_SOLUTION_GOOD,51.76,-1.26,110,{place},30U,0,0,0,{roll:.9f},{pitch:.9f},{yaw:.9f}"
+    turn = ",".join(f"{value:.9f}" for value in angles(pose))
+    return f"INS_SOLUTION_GOOD,51.76,-1.26,110,{place},30U,0,0,0,{turn}"
