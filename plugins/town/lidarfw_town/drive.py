@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from lidarfw_town.bodies import KINDS
+from lidarfw_town.beams import Body, merge
+from lidarfw_town.bodies import KINDS, make
 from lidarfw_town.light import WEATHER
 from lidarfw_town.mesh import Array, Mesh, join
 from lidarfw_town.sensors import Floats, Hits, Lidar, Scene, first_hits, receive
@@ -35,7 +36,7 @@ class Object:
 class TownFrame:
     """A scan with its truth. Points (N, 4) x, y, z, remission; `label` (N,) SemanticKITTI's uint32, class and instance.
 
-    `pose` (4, 4) maps the frame of the points to the world; `movers` are the moving objects as the scan saw them.
+    `pose` (4, 4) maps the frame of the points to the world; `bodies` are the moving objects as the scan saw them.
     """
 
     number: int
@@ -44,8 +45,16 @@ class TownFrame:
     label: np.ndarray
     objects: list[Object]
     pose: Array
-    movers: Scene
+    bodies: list[Body]
     grid: Floats  # (beams, columns) ranges in metres, 0 where nothing came back
+
+    @cached_property
+    def movers(self) -> Scene:
+        """The moving objects, for rays of a camera."""
+        return Scene(join([body.placed for body in self.bodies]))
+
+
+Passed = tuple[Mover | Parked, Body, float, Array]  # an object; its body, the moment, the LiDAR's pose when passed
 
 
 class Drive:
@@ -78,18 +87,15 @@ class Drive:
     @cached_property
     def still(self) -> Scene:
         """The town with its parked vehicles."""
-        return Scene(join([self.world.mesh, *self._parked.values()]))
+        return Scene(join([self.world.mesh, *(body.placed for body in self._parked.values())]))
 
     @cached_property
-    def _parked(self) -> dict[int, Mesh]:
-        return {
-            p.id: self._placed(p, p.pose, Mover(p.id, p.kind, p.seed, np.zeros((2, 4))).body(0))
-            for p in self.traffic.parked
-        }
+    def _parked(self) -> dict[int, Body]:
+        return {p.id: self._body(p, p.pose, make(p.kind, p.seed).without_glow()) for p in self.traffic.parked}
 
-    def _placed(self, thing: Mover | Parked, state: Array, body: Mesh) -> Mesh:
+    def _body(self, thing: Mover | Parked, state: Array, mesh: Mesh) -> Body:
         height = self.traffic.height(thing.kind, state)
-        return body.placed(float(state[0]), float(state[1]), height, float(state[2])).with_instance(thing.id)
+        return Body(thing.id, mesh, (float(state[0]), float(state[1]), height), float(state[2]))
 
     def poses(self, steps: Array) -> Array:
         """Poses (S, 4, 4) of the LiDAR in the world at moments counted in periods."""
@@ -110,46 +116,58 @@ class Drive:
         """The scan whose middle is at a step of the drive; the same for the same arguments, in any order of calls."""
         rng = np.random.default_rng((self.seed, 5, self.traversal, step))
         pose = self.poses(np.array([float(step)]))[0]
-        bodies = self._bodies(step, pose)
-        movers = Scene(join([body for thing, body, _ in bodies if isinstance(thing, Mover)]))
         origins, directions = self._rays(step)
-        hits = first_hits([self.still, movers], origins, directions)
+        bodies = self._bodies(step, pose)
+        hits, beams = self._hits(bodies, origins, directions)
         scan = receive(self.lidar, hits, directions, rng, WEATHER[self.weather])
-        back = scan.range.ravel() > 0.5
+        back = np.flatnonzero(scan.range.ravel() > 0.5)
         local = self._directions.reshape(-1, 3)[back] * scan.range.ravel()[back, None]
         if self.compensated:
             world = origins[back] + directions[back] * scan.range.ravel()[back, None]
             local = (world - pose[:3, 3]) @ pose[:3, :3]
         points = np.concatenate([local, scan.remission.ravel()[back, None]], 1).astype(np.float32)
         instance = scan.instance.ravel()[back]
-        objects = self._objects(bodies, step, pose, hits, instance, origins, directions)
+        objects = self._objects(bodies, pose, beams, _counts(hits.instance), _counts(instance))
         label = _labels(scan.semantic.ravel()[back], instance, objects)
-        return TownFrame(step, step * self.lidar.turn, points, label, objects, pose, movers, scan.range)
+        moving = [body for thing, body, _, _ in bodies if isinstance(thing, Mover)]
+        return TownFrame(step, step * self.lidar.turn, points, label, objects, pose, moving, scan.range)
 
     def _rays(self, step: int) -> tuple[Floats, Floats]:
         """Origins and directions (beams * columns, 3) in the world; every column from where the vehicle then is."""
         poses = self.poses(step + self._shares.astype(float))
-        directions = np.einsum("cij,bcj->bci", poses[:, :3, :3], self._directions, optimize=False)
-        origins = np.broadcast_to(poses[None, :, :3, 3], directions.shape)
-        return (
-            np.ascontiguousarray(origins, np.float32).reshape(-1, 3),
-            np.ascontiguousarray(directions, np.float32).reshape(-1, 3),
-        )
+        turns, places = (np.ascontiguousarray(part, np.float32) for part in (poses[:, :3, :3], poses[:, :3, 3]))
+        ahead, left, up = (np.ascontiguousarray(self._directions[..., axis]) for axis in range(3))
+        turned = [ahead * turn[:, 0] + left * turn[:, 1] + up * turn[:, 2] for turn in turns.swapaxes(0, 1)]
+        return np.tile(places, (len(ahead), 1)), np.stack(turned, -1).reshape(-1, 3)
 
-    def _bodies(self, step: int, pose: Array) -> list[tuple[Mover | Parked, Mesh, float]]:
-        """Everything movable near by, where it is when the beams pass it, and that moment."""
-        bodies: list[tuple[Mover | Parked, Mesh, float]] = []
+    def _bodies(self, step: int, pose: Array) -> list[Passed]:
+        """Everything movable near by, where it is when the beams pass it."""
         things: list[Mover | Parked] = [*self.traffic.movers, *self.traffic.parked]
-        for thing in things:
-            state = thing.at(step) if isinstance(thing, Mover) else thing.pose
-            if np.hypot(*(state[:2] - pose[:2, 3])) > SEEN_FROM:
-                continue
-            moment = step + self._passed(state, pose)
-            if isinstance(thing, Parked):
-                bodies.append((thing, self._parked[thing.id], moment))
-            else:
-                bodies.append((thing, self._placed(thing, thing.at(moment), thing.body(moment)), moment))
+        states = [thing.at(step) if isinstance(thing, Mover) else thing.pose for thing in things]
+        near = [np.hypot(*(state[:2] - pose[:2, 3])) <= SEEN_FROM for state in states]
+        moments = [step + self._passed(state, pose) for state in states]
+        bodies: list[Passed] = []
+        for thing, moment, frame, close in zip(things, moments, self.poses(np.array(moments)), near):
+            if close and isinstance(thing, Parked):
+                bodies.append((thing, self._parked[thing.id], moment, frame))
+            elif close and isinstance(thing, Mover):
+                bodies.append((thing, self._body(thing, thing.at(moment), thing.body(moment)), moment, frame))
         return bodies
+
+    def _hits(self, bodies: list[Passed], origins: Floats, directions: Floats) -> tuple[Hits, dict[int, int]]:
+        """What the beams meet first; and how many would reach an object that stood alone, of those that some reach."""
+        hits = first_hits([self.still], origins, directions)
+        travel = float(np.linalg.norm(origins[0] - origins[-1]))
+        windows = {body.id: body.window(self.lidar, frame, travel) for _, body, _, frame in bodies}
+        beams = {}
+        for thing, body, _, _ in bodies:
+            rows = windows[body.id]
+            if isinstance(thing, Mover) or (hits.instance[rows] == body.id).any():
+                distance, triangle = body.meet(origins[rows], directions[rows])
+                beams[body.id] = int((triangle >= 0).sum())
+                if isinstance(thing, Mover):
+                    merge(hits, body, rows, distance, triangle)
+        return hits, beams
 
     def _passed(self, state: Array, pose: Array) -> float:
         """When in a turn, -0.5..0.5, the beams pass a place."""
@@ -157,29 +175,29 @@ class Drive:
         return float(-np.arctan2(local[1], local[0]) / (2 * np.pi))
 
     def _objects(
-        self, bodies: list[tuple[Mover | Parked, Mesh, float]], step: int, pose: Array, hits: Hits,
-        instance: np.ndarray, origins: Floats, directions: Floats,
-    ) -> list[Object]:  # fmt: skip
-        """The truth about all objects that some beam would reach if nothing stood before them."""
-        numbers, reached = np.unique(hits.instance, return_counts=True)
-        beams = dict(zip(numbers.tolist(), reached.tolist()))
-        numbers, left = np.unique(instance, return_counts=True)
-        points = dict(zip(numbers.tolist(), left.tolist()))
-        moments = np.array([moment for _, _, moment in bodies])
-        frames = self.poses(moments) if not self.compensated else np.broadcast_to(pose, (len(moments), 4, 4))
+        self, bodies: list[Passed], pose: Array, beams: dict[int, int], reached: dict[int, int], points: dict[int, int]
+    ) -> list[Object]:
+        """The truth about all objects that some beam reaches; `beams`, `reached`, `points` are numbers by object."""
         objects = []
-        for (thing, body, moment), frame in zip(bodies, frames):
-            if beams.get(thing.id, 0) == 0:
+        for thing, body, moment, frame in bodies:
+            if thing.id not in reached:
                 continue
+            axes_of = pose if self.compensated else frame
             state = thing.at(moment) if isinstance(thing, Mover) else np.append(thing.pose, 0.0)
-            visible = beams[thing.id] / max(_beams_on(body, origins, directions), beams[thing.id])
-            speed, axes = float(state[3]), frame[:3, :3].T @ (np.cos(state[2]), np.sin(state[2]), 0.0)
+            speed, axes = float(state[3]), axes_of[:3, :3].T @ (np.cos(state[2]), np.sin(state[2]), 0.0)
             velocity = (float(axes[0] * speed), float(axes[1] * speed))
-            box = _box_of(body, frame, float(np.arctan2(axes[1], axes[0])))
+            box = _box_of(body.placed, axes_of, float(np.arctan2(axes[1], axes[0])))
+            visible = reached[thing.id] / max(beams[thing.id], reached[thing.id])
             objects.append(
                 Object(thing.id, thing.kind, box, velocity, speed > _MOVES, points.get(thing.id, 0), visible)
             )
         return objects
+
+
+def _counts(instance: np.ndarray) -> dict[int, int]:
+    """How often every number but 0 occurs."""
+    numbers, counts = np.unique(instance[instance > 0], return_counts=True)
+    return dict(zip(numbers.tolist(), counts.tolist()))
 
 
 def _box_of(body: Mesh, frame: Array, yaw: float) -> tuple[float, ...]:
@@ -191,20 +209,6 @@ def _box_of(body: Mesh, frame: Array, yaw: float) -> tuple[float, ...]:
     low, high = local.min(0), local.max(0)
     center = turn @ ((low + high) / 2)
     return (*center.tolist(), *(high - low).tolist(), yaw)
-
-
-def _beams_on(body: Mesh, origins: Floats, directions: Floats) -> int:
-    """How many rays hit a body that stands alone."""
-    low, high = body.triangles.min((0, 1)), body.triangles.max((0, 1))
-    middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2 + 0.1
-    towards = middle - origins[len(origins) // 2]
-    distance = float(np.linalg.norm(towards))
-    if distance < radius + 1.5:
-        rows = np.arange(len(directions))
-    else:
-        angle = np.arcsin(min((radius + 1.5) / distance, 1.0))  # 1.5 m: the vehicle moves within a turn
-        rows = np.flatnonzero(directions @ (towards / distance) > np.cos(angle))
-    return int((Scene(body).cast(origins[rows], directions[rows])[1] >= 0).sum())
 
 
 def _labels(semantic: np.ndarray, instance: np.ndarray, objects: list[Object]) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -51,7 +53,7 @@ def pave(area: BaseGeometry, hills: Hills, surface: Surface, rng: np.random.Gene
     flat = np.concatenate([corners, hills.height(corners)[..., None] + lift], -1)
     mesh = of(flat, surface)
     shade = rng.normal(1, 0.04, (len(mesh), 1)).astype(np.float32)
-    return Mesh(mesh.triangles, mesh.semantic, mesh.reflectance, np.clip(mesh.colour * shade, 0, 1), mesh.instance)
+    return replace(mesh, colour=np.clip(mesh.colour * shade, 0, 1))
 
 
 def _third(flat: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -16,11 +17,15 @@ Vector = Sequence[float] | npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Surface:
-    """A SemanticKITTI class id, the LiDAR reflectance (1 and above: retro-reflective), and the albedo, RGB 0..1."""
+    """A SemanticKITTI class id, the LiDAR reflectance (1 and above: retro-reflective), and the albedo, RGB 0..1.
+
+    `glow` is the light that a lamp sends out where lamps are on, relative to a white surface in the sun.
+    """
 
     semantic: int
     reflectance: float
     colour: tuple[float, float, float]
+    glow: float = 0.0
 
     def varied(self, rng: np.random.Generator, amount: float = 0.12) -> Surface:
         """The same surface with another shade, and independently of that another reflectance."""
@@ -30,13 +35,13 @@ class Surface:
         return replace(self, reflectance=reflectance, colour=(red, green, blue))
 
 
-ROAD = Surface(40, 0.27, (0.30, 0.30, 0.31))
-PARKING = Surface(44, 0.30, (0.38, 0.37, 0.36))
-PAVEMENT = Surface(48, 0.33, (0.52, 0.50, 0.47))
+ROAD = Surface(40, 0.30, (0.30, 0.30, 0.31))
+PARKING = Surface(44, 0.33, (0.38, 0.37, 0.36))
+PAVEMENT = Surface(48, 0.34, (0.52, 0.50, 0.47))
 KERB = Surface(48, 0.36, (0.60, 0.59, 0.57))
-BUILDING = Surface(50, 0.42, (0.70, 0.62, 0.52))
+BUILDING = Surface(50, 0.45, (0.70, 0.62, 0.52))
 ROOF = Surface(50, 0.30, (0.42, 0.22, 0.17))
-GLASS = Surface(50, 0.06, (0.20, 0.26, 0.32))
+GLASS = Surface(50, 0.04, (0.20, 0.26, 0.32))
 FENCE = Surface(51, 0.36, (0.42, 0.33, 0.24))
 RAIL = Surface(51, 0.45, (0.62, 0.64, 0.66))
 STRUCTURE = Surface(52, 0.40, (0.55, 0.54, 0.52))
@@ -44,14 +49,14 @@ MARKING = Surface(60, 0.55, (0.90, 0.90, 0.88))
 FOLIAGE = Surface(70, 0.36, (0.22, 0.38, 0.14))
 TRUNK = Surface(71, 0.34, (0.33, 0.26, 0.20))
 TERRAIN = Surface(72, 0.37, (0.34, 0.44, 0.20))
-POLE = Surface(80, 0.30, (0.45, 0.47, 0.48))
-SIGN = Surface(81, 1.6, (0.85, 0.20, 0.18))
+POLE = Surface(80, 0.22, (0.45, 0.47, 0.48))
+SIGN = Surface(81, 0.6, (0.85, 0.20, 0.18))
 OTHER = Surface(99, 0.38, (0.25, 0.33, 0.30))
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles (T, 3, 3) in metres, and per triangle: class (T,), reflectance (T,), colour (T, 3), instance (T,).
+    """Triangles (T, 3, 3) in metres, and class, reflectance, colour (T, 3), instance and glow of each.
 
     The instance is the track id of a movable object, 0 for all else.
     """
@@ -61,6 +66,7 @@ class Mesh:
     reflectance: npt.NDArray[np.float32]
     colour: npt.NDArray[np.float32]
     instance: npt.NDArray[np.int32]
+    glow: npt.NDArray[np.float32]
 
     def __len__(self) -> int:
         return len(self.triangles)
@@ -72,6 +78,11 @@ class Mesh:
         cross = np.cross(b - a, c - a)
         length = np.linalg.norm(cross, axis=1, keepdims=True)
         return np.asarray(cross / np.maximum(length, 1e-12), np.float32)
+
+    @functools.cached_property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest x, y, z."""
+        return self.triangles.min((0, 1)).astype(np.float64), self.triangles.max((0, 1)).astype(np.float64)
 
     def placed(self, x: float, y: float, z: float, yaw: float) -> Mesh:
         """The mesh turned by `yaw` about z and moved."""
@@ -86,6 +97,10 @@ class Mesh:
     def with_instance(self, instance: int) -> Mesh:
         """The mesh as the object of that number."""
         return replace(self, instance=np.full(len(self), instance, np.int32))
+
+    def without_glow(self) -> Mesh:
+        """The mesh with its lamps off."""
+        return replace(self, glow=np.zeros(len(self), np.float32))
 
     def with_semantic(self, semantic: int) -> Mesh:
         """The mesh with one class for all of it."""
@@ -103,7 +118,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     """All triangles of the meshes, in their order."""
     if not meshes:
         return of(np.zeros((0, 3, 3)), ROAD)
-    names = ("triangles", "semantic", "reflectance", "colour", "instance")
+    names = ("triangles", "semantic", "reflectance", "colour", "instance", "glow")
     return Mesh(*(np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in names))
 
 
@@ -117,6 +132,7 @@ def of(triangles: npt.ArrayLike, surface: Surface) -> Mesh:
         np.full(count, surface.reflectance, np.float32),
         np.tile(np.array(surface.colour, np.float32), (count, 1)),
         np.zeros(count, np.int32),
+        np.full(count, surface.glow, np.float32),
     )
 
 
@@ -156,14 +172,16 @@ def ball(center: Vector, radii: Vector, surface: Surface) -> Mesh:
 
 def tube(start: Vector, end: Vector, radius: float, surface: Surface, taper: float = 1.0, sections: int = 6) -> Mesh:
     """A round bar between two places, `taper` times as thick at its end."""
-    a, b = np.asarray(start, float), np.asarray(end, float)
-    axis = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
-    side = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
-    side /= np.linalg.norm(side)
-    unit = _unit_tube(sections)
-    width = radius * (1 + (taper - 1) * unit[..., 2:])
-    flat = unit[..., :1] * side + unit[..., 1:2] * np.cross(axis, side)
-    return of(a + flat * width + unit[..., 2:] * (b - a), surface)
+    a, along = np.asarray(start, float), np.asarray(end, float) - start
+    x, y, z = (along / max(math.hypot(*along), 1e-9)).tolist()
+    # at a right angle to the axis: its cross product with y, or with x where it is near to y
+    side = np.array((-z, 0.0, x) if abs(y) < 0.9 else (0.0, z, -y)) / (
+        math.hypot(x, z) if abs(y) < 0.9 else math.hypot(y, z)
+    )
+    other = (y * side[2] - z * side[1], z * side[0] - x * side[2], x * side[1] - y * side[0])
+    unit = _unit_tube(sections).copy()
+    unit[..., :2] *= radius * (1 + (taper - 1) * unit[..., 2:])
+    return of(unit @ np.array([side, other, along]) + a, surface)
 
 
 def leaves(

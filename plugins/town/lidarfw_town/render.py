@@ -1,4 +1,4 @@
-"""Pictures of the town by ray casting: colour shaded by sun and sky, depth, semantics, instances."""
+"""Pictures of the town by ray casting: colour shaded by sun, sky and lamps, depth, semantics, instances."""
 
 from __future__ import annotations
 
@@ -9,29 +9,51 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 from lidarfw.types import Camera
+from scipy import ndimage
 
+from lidarfw_town.bodies import make
 from lidarfw_town.camera import rays_of
-from lidarfw_town.light import Light, light_of
+from lidarfw_town.light import Lamps, Light, lamps_of, light_of
 from lidarfw_town.mesh import Array
-from lidarfw_town.sensors import Floats, Hits, Scene, first_hits
+from lidarfw_town.sensors import Floats, Scene, cast, surfaces
 
 if TYPE_CHECKING:
     from lidarfw_town.drive import Drive, TownFrame
 
 _BLOCK = 1 << 16  # rays that are shaded together, so that they stay in the caches of the processor
+_WET = (40, 44, 48, 60)  # classes that rain makes glossy
+_OWN_SEED = (0, 8)
+_OWN_ROOF = 1.28  # metres above the ground, as the LiDAR's own roof
+_OWN_BEHIND = 0.35  # metres of the middle of the own vehicle behind the LiDAR
+_FAINT = 0.004  # light of a lamp below which its shadow is not looked for
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
     """A picture: image (H, W, 3) uint8 RGB, depth (H, W) metres, 0 where no surface is, class and track id (H, W).
 
-    The depth is that of `Camera.project`: z in the camera frame for a pinhole, the distance for other models.
+    The depth is that of `Camera.project`: z in the camera frame for a pinhole, the distance for other models. The own
+    vehicle has class 0, as the sky.
     """
 
     image: npt.NDArray[np.uint8]
     depth: Floats
     semantic: npt.NDArray[np.uint16]
     instance: npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Surfaces that rays meet: place, normal towards the eye, direction of the ray (N, 3), and what they are."""
+
+    place: Floats
+    normal: Floats
+    along: Floats
+    distance: Floats
+    semantic: npt.NDArray[np.uint16]
+    reflectance: Floats
+    colour: Floats
+    glow: Floats
 
 
 def photograph(drive: Drive, frame: TownFrame, camera: Camera) -> Rendering:
@@ -43,74 +65,161 @@ def photograph(drive: Drive, frame: TownFrame, camera: Camera) -> Rendering:
     spot = [round(1000 * value) for value in rays_of(camera)[0].tolist()]
     rng = np.random.default_rng((drive.seed, 7, drive.traversal, frame.number, *(abs(2 * s) + (s < 0) for s in spot)))
     light = light_of(drive.seed, drive.traversal, drive.weather)
-    return render([drive.still, frame.movers], camera, frame.pose, light, rng)
+    lamps = lamps_of(drive.still, frame.bodies, frame.pose, drive.lidar.height) if light.lamps else None
+    scenes = [drive.still, frame.movers, _own(frame, drive.lidar.height)]
+    return render(scenes, camera, frame.pose, light, rng, lamps)
 
 
-def render(scenes: Sequence[Scene], camera: Camera, pose: Array, light: Light, rng: np.random.Generator) -> Rendering:
+def _own(frame: TownFrame, height: float) -> Scene:
+    """The own vehicle, of no class."""
+    body = make("car", _OWN_SEED).fitted(4.6, 1.8, _OWN_ROOF).with_semantic(0)
+    return Scene(body.moved(frame.pose[:3, :3], frame.pose[:3, :3] @ (-_OWN_BEHIND, 0, -height) + frame.pose[:3, 3]))
+
+
+def render(
+    scenes: Sequence[Scene], camera: Camera, pose: Array, light: Light, rng: np.random.Generator,
+    lamps: Lamps | None = None,
+) -> Rendering:  # fmt: skip
     """A picture of scenes. `pose` (4, 4) is that of the LiDAR, in whose frame the camera is given, in the world."""
     place, rays, scale = rays_of(camera)
     origin = (pose[:3, :3] @ place + pose[:3, 3]).astype(np.float32)
-    count = len(rays)
-    image, depth = np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
+    near = lamps.within(origin) if lamps else None
+    size, count = (camera.height, camera.width), len(rays)
+    colour, depth = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     semantic, instance = np.zeros(count, np.uint16), np.zeros(count, np.int32)
     for start in range(0, count, _BLOCK):
         rows = start + np.flatnonzero(rays[start : start + _BLOCK].any(1))
         directions = np.ascontiguousarray(rays[rows] @ pose[:3, :3].T.astype(np.float32))
-        hits = first_hits(scenes, np.tile(origin, (len(rows), 1)), directions)
-        image[rows] = _exposed(_colour(hits, origin, directions, scenes, light), light, rng)
-        depth[rows] = np.where(hits.semantic > 0, hits.distance * scale[rows], 0)
-        semantic[rows], instance[rows] = hits.semantic, hits.instance
-    size = (camera.height, camera.width)
-    return Rendering(image.reshape(*size, 3), depth.reshape(size), semantic.reshape(size), instance.reshape(size))
+        distance, index = cast(scenes, np.tile(origin, (len(rows), 1)), directions)
+        colour[rows] = _sky(directions, light)
+        met = np.flatnonzero(index >= 0)
+        seen = _seen(scenes, origin, directions[met], distance[met], index[met], light)
+        colour[rows[met]] = _through_air(_shade(seen, scenes, light, near), seen.distance, light)
+        depth[rows[met]] = seen.distance * scale[rows[met]]
+        semantic[rows[met]], instance[rows[met]] = seen.semantic, surfaces(scenes, index[met], "instance")
+    image = _exposed(colour.reshape(*size, 3), light, rng)
+    image[~rays.any(1).reshape(size)] = 0
+    return Rendering(image, depth.reshape(size), semantic.reshape(size), instance.reshape(size))
 
 
-def _exposed(colour: Array, light: Light, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """What the sensor of the camera makes of light (N, 3): exposure, noise, and the curve of a picture."""
-    grain = rng.normal(0, light.grain, colour.shape)
-    tone = np.clip(colour * light.exposure + grain, 0, 1) ** (1 / 1.9)
+def _seen(
+    scenes: Sequence[Scene], origin: Floats, along: Floats, distance: Floats, index: npt.NDArray[np.int64], light: Light
+) -> _Seen:
+    normal = surfaces(scenes, index, "normals")
+    normal = np.where((normal * along).sum(1, keepdims=True) > 0, -normal, normal)
+    place = origin + along * distance[:, None] + normal * 0.01
+    semantic, reflectance, colour, glow = (
+        surfaces(scenes, index, name) for name in ("semantic", "reflectance", "colour", "glow")
+    )
+    glow = glow + _lit_windows(semantic, reflectance, index, normal)
+    return _Seen(place, normal, along, distance, semantic, reflectance, colour, glow * np.float32(light.lamps))
+
+
+def _lit_windows(
+    semantic: npt.NDArray[np.uint16], reflectance: Floats, index: npt.NDArray[np.int64], normal: Floats
+) -> Floats:
+    """Light behind some windows. A window is two triangles, one after the other."""
+    pane = (semantic == 50) & (reflectance < 0.08)
+    # both triangles of a window have one number, whichever of them has the even place
+    draw = np.modf(np.abs(np.sin((index // 2 + 0.5) * 12.9898 + normal[:, 0])) * 43758.5453)[0]
+    return np.asarray(np.where(pane & (draw < 0.25), 0.45, 0.0), np.float32)
+
+
+def _through_air(colour: Array, distance: Floats, light: Light) -> Array:
+    """Light (N, 3) after its way through haze."""
+    haze = 1 - np.exp(-distance * np.float32(light.haze))[:, None]
+    return np.asarray(colour * (1 - haze) + np.array(light.air) * haze)
+
+
+def _shade(seen: _Seen, scenes: Sequence[Scene], light: Light, lamps: Lamps | None) -> Array:
+    """Lambertian light (N, 3) of sun, sky and lamps, what glows, and the gloss of glass, paint and wet roads."""
+    wet = np.isin(seen.semantic, _WET)[:, None] & light.wet
+    albedo = seen.colour**1.6 * _texture(seen.place, seen.semantic)[:, None] * np.where(wet, 0.55, 1.0)
+    lit = _sunlight(seen, scenes, light) + (0.30 + 0.14 * seen.normal[:, 2:]) * np.array(light.ambient)
+    if lamps:
+        lit = lit + _lamplight(seen, scenes, lamps) * light.lamps
+    # what a surface glows in is its own colour, a window's the yellow of a room
+    room = np.where((seen.semantic == 50)[:, None], np.array([1.0, 0.78, 0.45]), seen.colour)
+    return np.asarray(albedo * lit + seen.glow[:, None] * room + _gloss(seen, wet, light))
+
+
+def _gloss(seen: _Seen, wet: npt.NDArray[np.bool_], light: Light) -> Array:
+    """The sky in glass, and in wet roads at grazing angles (Schlick's form of Fresnel's reflection)."""
+    cosine = np.abs((seen.along * seen.normal).sum(1, keepdims=True))
+    mirror = seen.along + 2 * cosine * seen.normal
+    glass = (seen.reflectance < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.25, 0, 1) * 0.4
+    film = wet * (0.04 + 0.5 * (1 - cosine) ** 5)
+    return np.asarray((glass + film) * np.array(light.horizon) * 0.9)
+
+
+def _sunlight(seen: _Seen, scenes: Sequence[Scene], light: Light) -> Array:
+    if light.direct < 0.01:
+        return np.zeros((len(seen.place), 3))
+    sun = np.array(light.sun, np.float32)
+    facing = np.maximum(seen.normal @ sun, 0)
+    rows = np.flatnonzero(facing > 0)
+    shadow = np.zeros(len(facing), bool)
+    shadow[rows] = _blocked(scenes, seen.place[rows], np.tile(sun, (len(rows), 1)))
+    # leaves let some of the light through
+    strength = np.where(shadow, 0.0, np.where(seen.semantic == 70, 0.35 + 0.5 * facing, facing))[:, None]
+    return np.asarray(strength * light.direct * 0.85 * np.array([1 + light.warmth, 1.0, 1 - light.warmth]))
+
+
+def _lamplight(seen: _Seen, scenes: Sequence[Scene], lamps: Lamps) -> Array:
+    """Light of the lamps, each with shadows; signs send that of headlights back to where it came from."""
+    total = np.zeros((len(seen.place), 3))
+    for place, axis, power, narrow, near in zip(lamps.place, lamps.axis, lamps.power, lamps.narrow, lamps.near):
+        way = (seen.place - place.astype(np.float32)).astype(np.float32)
+        distance = np.linalg.norm(way, axis=1)
+        way /= np.maximum(distance, 1e-3)[:, None]
+        facing = np.maximum(-(way * seen.normal).sum(1), 0)
+        facing = np.where(seen.semantic == 81, np.maximum(facing * (1 + 0.5 * narrow), 0), facing)
+        strength = np.maximum(way @ axis.astype(np.float32), 0) ** narrow * facing / np.maximum(distance, near) ** 2
+        rows = np.flatnonzero(strength * power[0] > _FAINT)
+        shadow = _blocked(scenes, seen.place[rows], -way[rows], distance[rows] - 0.4)
+        total[rows[~shadow]] += strength[rows[~shadow], None] * power
+    return total
+
+
+def _blocked(
+    scenes: Sequence[Scene], origins: Floats, directions: Floats, reach: Floats | None = None
+) -> npt.NDArray[np.bool_]:
+    """Whether something stands in the way of rays (N, 3), within a reach (N,) in metres or at all."""
+    distance, index = cast(scenes, np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions))
+    return np.asarray(index >= 0) if reach is None else np.asarray(distance < reach)
+
+
+def _exposed(colour: Floats, light: Light, rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+    """The picture that a camera makes of light (H, W, 3): glare around lamps, rain, exposure, noise, tone curve."""
+    if light.lamps:
+        colour = colour + _glare(colour)
+    if light.rain:
+        colour = _streaked(colour, light, rng)
+    grain = rng.standard_normal(colour.shape, np.float32) * np.float32(light.grain)
+    tone = np.clip(colour * np.float32(light.exposure) + grain, 0, 1) ** np.float32(1 / 1.9)
     return np.asarray(np.round(tone * 255), np.uint8)
 
 
-def _colour(hits: Hits, origin: Floats, directions: Floats, scenes: Sequence[Scene], light: Light) -> Array:
-    """Light (N, 3) that comes along rays: of the surface or the sky, through haze."""
-    seen = np.flatnonzero(hits.semantic > 0)
-    colour = _sky(directions, light)
-    colour[seen] = _surface(hits, origin, directions, seen, scenes, light)
-    haze = 1 - np.exp(-np.minimum(hits.distance, 1e3) * light.haze)[seen, None]
-    colour[seen] = colour[seen] * (1 - haze) + np.array(light.air) * haze
-    return colour
+def _glare(colour: Floats) -> Floats:
+    """Light that the lens scatters around what is brighter than white."""
+    bright = np.clip(colour - 1, 0, 6)
+    wide = colour.shape[1] / 130
+    return np.asarray(0.5 * ndimage.gaussian_filter(bright, (wide, wide, 0)), np.float32)
 
 
-def _surface(
-    hits: Hits, origin: Floats, directions: Floats, seen: npt.NDArray[np.int64], scenes: Sequence[Scene], light: Light
-) -> Array:
-    """Lambertian light of sun and sky on what was hit, with cast shadows and a little gloss on glass and paint."""
-    sun = np.array(light.sun, np.float32)
-    normal, along = hits.normal[seen], directions[seen]
-    normal = np.where((normal * along).sum(1, keepdims=True) > 0, -normal, normal)
-    place = origin + along * hits.distance[seen, None] + normal * 0.01
-    facing = np.maximum(normal @ sun, 0)
-    shadow = _hidden(scenes, place, sun, facing > 0)
-    leafy = hits.semantic[seen] == 70  # leaves let some of the light through
-    direct = np.where(shadow, 0.0, np.where(leafy, 0.35 + 0.5 * facing, facing))[:, None] * light.direct
-    ambient = (0.30 + 0.14 * normal[:, 2:]) * np.array(light.ambient)
-    sunlight = 0.85 * np.array([1 + light.warmth, 1.0, 1 - light.warmth])
-    albedo = hits.colour[seen] ** 1.6 * _texture(place, hits.semantic[seen])[:, None]
-    mirror = along - 2 * (along * normal).sum(1, keepdims=True) * normal
-    glossy = (hits.reflectance[seen] < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.25, 0, 1) * 0.4
-    return np.asarray(albedo * (ambient + sunlight * direct) + glossy * np.array([0.6, 0.72, 0.9]))
-
-
-def _hidden(
-    scenes: Sequence[Scene], place: Floats, direction: Floats, chosen: npt.NDArray[np.bool_]
-) -> npt.NDArray[np.bool_]:
-    """Whether something stands between places (N, 3) and a far light, for the chosen ones."""
-    rows = np.flatnonzero(chosen)
-    origins, towards = np.ascontiguousarray(place[rows]), np.tile(direction, (len(rows), 1))
-    hidden = np.zeros(len(place), bool)
-    for scene in scenes:
-        hidden[rows] |= scene.cast(origins, towards)[1] >= 0
-    return hidden
+def _streaked(colour: Floats, light: Light, rng: np.random.Generator) -> Floats:
+    """Falling drops, as short bright streaks."""
+    height, width = colour.shape[:2]
+    count, length = max(int(light.rain * height * width / 1e6), 1), max(height // 18, 2)
+    top, left = rng.integers(-length, height, count), rng.integers(0, width, count)
+    lean = rng.normal(0.06, 0.03, count)
+    steps = np.arange(length)
+    rows = top[:, None] + steps
+    columns = np.round(left[:, None] + lean[:, None] * steps).astype(int)
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    alpha = np.zeros((height, width, 1), np.float32)
+    alpha[rows[inside], columns[inside], 0] = 0.16
+    return np.asarray(colour * (1 - alpha) + np.array(light.air, np.float32) * alpha)
 
 
 def _texture(place: Floats, semantic: npt.NDArray[np.uint16]) -> Array:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -49,11 +51,15 @@ def _even(up: float, down: float, count: int) -> tuple[float, ...]:
 
 
 LIDARS = {
-    "hdl64": Lidar("hdl64", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 2048, 0.02, 80.0, 0.006),
+    # its elevations are those that KITTI's scans show about their origin
+    "hdl64": Lidar("hdl64", _even(2.4, -7.8, 32) + _even(-8.4, -23.7, 32), 2048, 0.02, 80.0, 0.006),
     "hdl32": Lidar("hdl32", _even(10.67, -30.67, 32), 2048, 0.02, 100.0, 0.008, 1.84),
     "ouster32": Lidar("ouster32", _even(22.5, -22.5, 32), 1024, 0.015, 120.0, 0.008, 1.8),
     "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 80.0, 0.006),
 }
+
+
+_ROUGH = (70, 71, 72)  # vegetation, trunks, terrain: matt at every incidence, and not quite where their triangles are
 
 
 class Scene:
@@ -75,18 +81,17 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays hit first, row by row: distance (1e37: nothing), class, instance, reflectance, colour, normal."""
+    """What rays hit first, row by row: distance (1e37: nothing), class, instance, reflectance, normal (N, 3)."""
 
     distance: Floats
     semantic: npt.NDArray[np.uint16]
     instance: npt.NDArray[np.int32]
     reflectance: Floats
-    colour: Floats
     normal: Floats
 
 
-def first_hits(scenes: list[Scene], origins: Floats, directions: Floats) -> Hits:
-    """The nearest hits of rays (N, 3) in several scenes."""
+def cast(scenes: Sequence[Scene], origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
+    """Distance (N,), 1e37 for none, and triangle (N,), counted through all scenes, -1 for none, of the first hits."""
     distance, triangle = scenes[0].cast(origins, directions)
     start, index = len(scenes[0].mesh), triangle.astype(np.int64)
     for scene in scenes[1:]:
@@ -94,24 +99,25 @@ def first_hits(scenes: list[Scene], origins: Floats, directions: Floats) -> Hits
         nearer = (triangle >= 0) & (other < distance)
         distance, index = np.where(nearer, other, distance), np.where(nearer, triangle + start, index)
         start += len(scene.mesh)
-    return _look_up(scenes, distance, index)
+    return distance, index
 
 
-def _look_up(scenes: list[Scene], distance: Floats, index: npt.NDArray[np.int64]) -> Hits:
-    count = len(distance)
-    hits = Hits(
-        distance, np.zeros(count, np.uint16), np.zeros(count, np.int32), np.zeros(count, np.float32),
-        np.zeros((count, 3), np.float32), np.zeros((count, 3), np.float32),
-    )  # fmt: skip
-    start = 0
+def first_hits(scenes: Sequence[Scene], origins: Floats, directions: Floats) -> Hits:
+    """The nearest hits of rays (N, 3) in several scenes."""
+    distance, index = cast(scenes, origins, directions)
+    names = ("semantic", "instance", "reflectance", "normals")
+    return Hits(distance, *(surfaces(scenes, index, name) for name in names))
+
+
+def surfaces(scenes: Sequence[Scene], index: npt.NDArray[np.int64], name: str) -> npt.NDArray[Any]:
+    """An attribute of the meshes at triangles (N,) as `cast` counts them; 0 where there is none."""
+    table = getattr(scenes[0].mesh, name)
+    values, start = np.zeros((len(index), *table.shape[1:]), table.dtype), 0
     for scene in scenes:
         rows = np.flatnonzero((index >= start) & (index < start + len(scene.mesh)))
-        triangles = index[rows] - start
-        for name in ("semantic", "instance", "reflectance", "colour"):
-            getattr(hits, name)[rows] = getattr(scene.mesh, name)[triangles]
-        hits.normal[rows] = scene.mesh.normals[triangles]
+        values[rows] = getattr(scene.mesh, name)[index[rows] - start]
         start += len(scene.mesh)
-    return hits
+    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,24 +144,33 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
         hits.reflectance * np.maximum(cosine, 0.01) * np.exp(-2 * weather * reach) / np.maximum(reach / 30, 0.15) ** 2
     )
     lost = rng.random(len(signal)) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
-    glassy = (hits.reflectance < 0.08) & (rng.random(len(signal)) < 0.55)
+    glassy = (hits.reflectance < 0.045) & (rng.random(len(signal)) < 0.55)
     gone = lost | glassy | (hits.distance > lidar.farthest) | _own_roof(lidar.rays()[0].reshape(-1, 3))
-    distance = hits.distance + rng.normal(0, lidar.noise, len(signal)).astype(np.float32)
+    noise = lidar.noise * np.where(np.isin(hits.semantic, _ROUGH), 2.0, 1.0)
+    distance = hits.distance + (rng.normal(0, 1, len(signal)) * noise).astype(np.float32)
     distance = np.where(gone, 0, distance).reshape(shape).astype(np.float32)
     mixed = _mix(distance, rng)
     semantic = np.where(mixed, 1, hits.semantic.reshape(shape)).astype(np.uint16)
     return Scan(
         distance,
-        _remission(hits, cosine, signal, rng).reshape(shape),
+        _remission(hits, cosine, rng).reshape(shape),
         semantic,
         np.where(mixed, 0, hits.instance.reshape(shape)),
     )
 
 
-def _remission(hits: Hits, cosine: Floats, signal: Floats, rng: np.random.Generator) -> Floats:
-    """Calibrated remission: mostly the reflectance, weaker at grazing incidence, 0 where the pulse was faint."""
-    value = hits.reflectance * (0.86 + 0.24 * cosine) * rng.normal(1, 0.13, len(cosine))
-    faint = rng.random(len(cosine)) < 1 / (1 + (signal / 0.035) ** 1.5)
+def _remission(hits: Hits, cosine: Floats, rng: np.random.Generator) -> Floats:
+    """Calibrated remission as KITTI's scans have it; 0 where the pulse was faint.
+
+    The device makes up for the range as far as 25 m. Smooth surfaces are weaker at grazing incidence. Dark paint and
+    far roads give 0.
+    """
+    rough = np.isin(hits.semantic, _ROUGH)
+    grazing = np.where(rough, 1.0, cosine / (cosine + 0.03))
+    far = np.minimum(1.0, 25.0 / np.maximum(hits.distance, 1.0)) ** 1.2
+    value = hits.reflectance * grazing * far * rng.normal(1, 0.15, len(cosine))
+    faint = value < rng.normal(0.1, 0.03, len(cosine))
+    faint |= (rng.random(len(cosine)) < 0.04) & ~rough  # seen at all ranges
     # levels of a hundredth, as the devices give them
     return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)
 
@@ -170,7 +185,7 @@ def _mix(distance: Floats, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
 
 
 def _own_roof(directions: Floats) -> npt.NDArray[np.bool_]:
-    """Rays, in the axes of the sensor, that the own roof stops: 0.45 m below, 0.65 m to each side."""
+    """Rays, in the axes of the sensor, that the own roof stops: 0.45 m below, 0.55 m to each side."""
     down = np.minimum(directions[:, 2], -1e-6)
     ahead, aside = -0.45 * directions[:, 0] / down, -0.45 * directions[:, 1] / down
-    return np.asarray((ahead < 0.6) & (ahead > -1.3) & (np.abs(aside) < 0.65))
+    return np.asarray((ahead < 1.2) & (ahead > -1.4) & (np.abs(aside) < 0.55))
