@@ -31,11 +31,11 @@ Matrix = npt.NDArray[np.float64]
 def move_frame(frame: Frame, matrix: Matrix) -> Frame:
     """The frame with its scene moved: points p become matrix @ p.
 
-    `matrix` (3, 3) is a turn about z, a mirror that keeps z, a scale, or a product of these, about the sensor.
-    Boxes keep their shape under it; an observation angle belongs to the picture and stays.
+    `matrix` (3, 3) is a turn about z, a mirror that keeps z, a scale, or a product of these, about the sensor;
+    (4, 4) may shift too. Boxes keep their shape under it; an observation angle belongs to the picture and stays.
     """
     whole = np.eye(4)
-    whole[:3, :3] = matrix
+    whole[: len(matrix), : len(matrix)] = matrix
     inputs = {name: _move_input(name, value, whole) for name, value in frame.inputs.items()}
     cameras = {name: camera.transformed(whole) for name, camera in frame.meta.cameras.items()}
     targets = Targets(
@@ -50,7 +50,7 @@ def move_frame(frame: Frame, matrix: Matrix) -> Frame:
 
 def _move_input(name: str, value: Any, matrix: Matrix) -> Any:
     if isinstance(value, Points):
-        return value.replace(xyz=_linear(value.xyz, matrix))
+        return value.replace(xyz=_affine(value.xyz, matrix))
     if isinstance(value, Image):
         return value.replace(cameras=tuple(camera.transformed(matrix) for camera in value.cameras))
     if isinstance(value, Poses):
@@ -69,12 +69,17 @@ def _linear(vectors: Tensor, matrix: Matrix) -> Tensor:
     return vectors @ torch.tensor(matrix[:size, :size].T, dtype=vectors.dtype)
 
 
+def _affine(places: Tensor, matrix: Matrix) -> Tensor:
+    """Places (N, 3) moved by the whole (4, 4)."""
+    return _linear(places, matrix) + torch.tensor(matrix[:3, 3], dtype=places.dtype)
+
+
 def _move_boxes(boxes: Boxes | None, matrix: Matrix) -> Boxes | None:
     if boxes is None:
         return None
     heading = _linear(torch.stack([boxes.yaw.cos(), boxes.yaw.sin()], 1), matrix)
     return boxes.replace(
-        center=_linear(boxes.center, matrix),
+        center=_affine(boxes.center, matrix),
         size=boxes.size * float(np.cbrt(abs(np.linalg.det(matrix[:3, :3])))),
         yaw=torch.atan2(heading[:, 1], heading[:, 0]),
         velocity=None if boxes.velocity is None else _linear(boxes.velocity, matrix),

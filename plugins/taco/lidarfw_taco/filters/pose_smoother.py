@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
-
 from lidarfw.interfaces import Filter
 from lidarfw.types import FrameResult, Poses, Spec
+from torch import Tensor
 
 
 @dataclass
