@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from lidarfw.errors import LidarfwError
+from lidarfw.ops.product import multiply, padded
 from lidarfw.ops.rulebook import Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
 from lidarfw.ops.scratch import scratch
 from lidarfw.types import Voxels
@@ -42,10 +43,11 @@ def convolve(
     output = features.new_empty(book.num_outputs, weight.shape[2])
     for block in blocks:
         products = scratch("products", block.pairs, weight.shape[2], features)
-        buffer = scratch("rows", max(block.sizes), weight.shape[1], features)
+        rows = scratch("rows", padded(max(block.sizes)), weight.shape[1], features)
         runs = zip(block.inputs, block.sizes, block.elements, products.split_with_sizes(block.sizes), strict=True)
         for inputs, size, element, product in runs:
-            torch.mm(torch.index_select(features, 0, inputs, out=buffer[:size]), weights[element], out=product)
+            torch.index_select(features, 0, inputs, out=rows[:size])
+            multiply(rows, weights[element], product)
         total = sum_block(block, products)
         if book.symmetric:
             total.addmm_(features[block.rows], weights[book.volume // 2])
@@ -95,7 +97,7 @@ def _gradients(
     d_weight = torch.zeros_like(weight) if need_weight else None
     for block in book.blocks():
         products = scratch("products", block.pairs, weight.shape[1], gradient)
-        arrived = scratch("rows", max(block.sizes), weight.shape[2], gradient)
+        arrived = scratch("rows", padded(max(block.sizes)), weight.shape[2], gradient)
         seen = scratch("features", max(block.sizes), weight.shape[1], features)
         runs = zip(
             block.inputs,
@@ -110,7 +112,7 @@ def _gradients(
             if d_weight is not None:
                 d_weight[element].addmm_(torch.index_select(features, 0, outputs, out=seen[:size]).t(), rows)
             if need_features:
-                torch.mm(rows, flipped[element], out=product)
+                multiply(arrived, flipped[element], product)
         if d_features is not None:
             d_features[block.rows] = sum_block(block, products)
     if book.symmetric:
