@@ -202,12 +202,12 @@ class DPDC2d(nn.Module):
             groups=self.groups,
             bias=self.bias is not None,
             circular=self.circular,
-        )
+        ).to(self.basis)
         with torch.no_grad():
             conv.weight.copy_(self.kernel())
             if self.bias is not None and conv.bias is not None:
                 conv.bias.copy_(self.bias)
-        return conv.to(self.basis).eval()
+        return conv.eval()
 
     def extra_repr(self) -> str:
         """As torch prints a module."""

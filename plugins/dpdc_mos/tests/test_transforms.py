@@ -1,0 +1,151 @@
+"""Range images, residual images and distance maps of frames."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from lidarfw.components.transforms.augmentation import RandomFlip, RandomRotation
+from lidarfw.errors import ConfigError
+from lidarfw.testing.synthetic import SyntheticDataset
+from lidarfw.types import DataSpec, Frame, FrameMeta, PointLabels, Points, RangeImage, Spec, Targets
+from lidarfw_dpdc_mos.distance import on_pixels
+from lidarfw_dpdc_mos.transforms import EdgeDistance, RangeProjection, ResidualImages
+from torch import Tensor
+
+RNG = np.random.default_rng(0)
+
+
+def frame(xyz: list[list[float]], time: list[float] | None = None, label: list[int] | None = None) -> Frame:
+    """A frame of these points, remission 0.5."""
+    points = Points.from_scan(
+        torch.tensor(xyz), torch.full((len(xyz), 1), 0.5), None if time is None else torch.tensor(time)
+    )
+    known = None
+    if label is not None:
+        known = PointLabels((torch.tensor(label)[:, None] == torch.arange(2)).float(), points.batch)
+    return Frame({"points": points}, Targets(points=known), FrameMeta("f"))
+
+
+def at(azimuth: float, distance: float, elevation: float = -5.0) -> list[float]:
+    a, e = math.radians(azimuth), math.radians(elevation)
+    return [distance * math.cos(e) * math.cos(a), distance * math.cos(e) * math.sin(a), distance * math.sin(e)]
+
+
+def test_pixels_of_the_paper_view() -> None:
+    xyz = [(10, 0, 0), (0, 10, -1), (5, 5, -1.73), (-10, 0.001, 0), (-10, -1e-9, 0), (10, 0, 1), (0, 0, 0)]
+    projected = RangeProjection()(frame([list(map(float, p)) for p in xyz]), RNG)
+    pixel = projected.inputs["range"].pixel
+    found = [(int(p) % 2048, int(p) // 2048) if p >= 0 else None for p in pixel]
+    # straight behind, -180 and 180 degrees are one direction: column 0 (the reference code clips to 2047)
+    assert found == [(1024, 6), (512, 19), (768, 38), (0, 6), (0, 6), (1024, 0), None]
+    assert RangeProjection(fov_policy="drop")(frame([[10.0, 0.0, 1.0]]), RNG).inputs["range"].pixel.tolist() == [-1]
+
+
+def test_the_image_holds_range_and_remission() -> None:
+    image: RangeImage = RangeProjection()(frame([at(10, 20), at(10, 9), at(-50, 30)]), RNG).inputs["range"]
+    assert image.features.shape == (1, 2, 64, 2048)
+    assert int(image.mask.sum()) == 2
+    assert sorted(image.features[0, 0][image.mask[0]].tolist()) == pytest.approx([9, 30])
+    assert image.features[0, 1][image.mask[0]].tolist() == [0.5, 0.5]
+    assert float(image.features[:, :, ~image.mask[0]].abs().max()) == 0
+
+
+def residuals(now: list[float], before: list[float], **options: object) -> list[float]:
+    """Residuals of points in columns of their own; -1 for none."""
+    angles = [10.0 * i for i in range(len(now))]
+    rows = [(at(a, r), 0.0) for a, r in zip(angles, now) if r > 0]
+    rows += [(at(a, r), -0.1) for a, r in zip(angles, before) if r > 0]
+    projected = RangeProjection()(frame([p for p, _ in rows], [t for _, t in rows]), RNG)
+    done = ResidualImages(count=1, **options)(projected, RNG)  # type: ignore[arg-type]
+    image = done.inputs["range"]
+    assert len(done.inputs["points"]) == len(image.pixel) == sum(r > 0 for r in now)
+    found: Tensor = image.features[0, 2].flatten()[image.pixel]
+    return [float(v) for v in found]
+
+
+def test_residuals() -> None:
+    now, before = [10, 20, 49, 51, 1.5, 30], [9, 20.5, -1, 48, 1.6, 45]
+    assert residuals(now, before) == pytest.approx([0.1, 0.025, 0, 0, 0, 0.5], abs=1e-5)
+    assert residuals(now, before, signed=True) == pytest.approx([-0.1, 0.025, 0, 0, 0, 0.5], abs=1e-5)
+    assert residuals(now, before, max_range=60, min_range=1) == pytest.approx(
+        [0.1, 0.025, 0, 3 / 51, 0.1 / 1.5, 0.5], abs=1e-5
+    )
+    assert residuals([3, 10], [30, 10], limit=5) == pytest.approx([5, 0], abs=1e-5)
+
+
+def test_strides_gaps_and_the_start_of_a_sequence() -> None:
+    times = [0.0, -0.1, -0.2, -0.3, -0.4]
+    whole = frame([at(0, 10 + k) for k in range(5)], times)
+
+    def channels(transform: ResidualImages, given: Frame = whole) -> list[float]:
+        image = transform(RangeProjection()(given, RNG), RNG).inputs["range"]
+        return [round(float(image.features[0, c].max()), 4) for c in range(2, image.features.shape[1])]
+
+    assert channels(ResidualImages(count=2)) == [0.1, 0.2]
+    assert channels(ResidualImages(count=2, stride=2)) == [0.2, 0.4]
+    assert channels(ResidualImages(count=0)) == []
+    assert channels(ResidualImages(count=3), frame([at(0, 10), at(0, 11)], [0.0, -0.1])) == [0.1, 0, 0]
+    assert channels(ResidualImages(count=2), frame([at(0, 10)])) == [0, 0]
+    gap = frame([at(0, 10), at(0, 11), at(0, 12)], [0.0, -0.1, -0.9])
+    assert channels(ResidualImages(count=2), gap) == [0.1, 0]
+
+
+def test_augmentation_moves_all_scans_alike() -> None:
+    """What stands still has residual 0 whichever way the scene is turned, and residuals do not depend on the turn."""
+    data = SyntheticDataset(frames=3, sequence_length=3, sweeps=3)
+    original = data[2]
+    for augment in (RandomFlip(axes=("x", "y"), probability=1.0), RandomRotation(angle=math.pi)):
+        totals = []
+        for given in (original, augment(original, np.random.default_rng(3))):
+            image = ResidualImages(count=2)(RangeProjection(height=32, width=256)(given, RNG), RNG).inputs["range"]
+            totals.append(float((image.features[0, 2:] > 0.02).sum()))
+        assert totals[0] > 50
+        assert totals[1] == pytest.approx(totals[0], rel=0.3)  # other pixel borders, the same scene
+
+
+def test_labels_stay_with_their_points() -> None:
+    given = frame([at(0, 10), at(20, 12), at(0, 11)], [0.0, 0.0, -0.1], [1, 0, 1])
+    done = ResidualImages(count=1)(RangeProjection()(given, RNG), RNG)
+    assert done.targets.points is not None
+    assert done.targets.points.label.tolist() == [1, 0]
+    assert (given.inputs["points"].xyz.shape[0], done.inputs["points"].xyz.shape[0]) == (3, 2)
+
+
+def test_distance_maps_in_the_loader() -> None:
+    xyz = [at(a / 2048 * 360, 10) for a in range(-2, 3)] + [at(a / 2048 * 360, 12) for a in range(3, 30)]
+    label = [1] * 5 + [0] * 27
+    done = EdgeDistance()(ResidualImages(count=0)(RangeProjection()(frame(xyz, label=label), RNG), RNG), RNG)
+    pixels = done.targets.pixels
+    assert pixels is not None
+    assert pixels.features.shape == (1, 1, 64, 2048)
+    row = int(done.inputs["range"].pixel[0]) // 2048
+    assert pixels.features[0, 0, row, 1022:1030].tolist() == [0, 0, 0, 0, 0, 1, 2, 3]
+    assert EdgeDistance()(RangeProjection()(frame(xyz), RNG), RNG).targets.pixels is None
+
+
+def test_a_pixel_shows_its_nearest_point() -> None:
+    given = frame([at(0, 12), at(0, 10), at(90, 5)], label=[0, 1, 0])
+    image = RangeProjection()(given, RNG).inputs["range"]
+    points = given.inputs["points"]
+    found = on_pixels(torch.tensor([7, 8, 9]), image, points, empty=-1)
+    assert sorted(found[found >= 0].tolist()) == [8, 9]
+    assert found.flatten()[image.pixel].tolist() == [8, 8, 9]
+
+
+def test_errors_say_what_to_do() -> None:
+    data = DataSpec({"points": Spec(Points, 1)}, sweeps=2)
+    with pytest.raises(ConfigError, match="range_projection,residual_images"):
+        ResidualImages().spec(data)
+    projected = RangeProjection().spec(data)
+    with pytest.raises(ConfigError, match="sweeps=3"):
+        ResidualImages().spec(projected)
+    assert ResidualImages(count=1).spec(projected).inputs["range"].channels == 3
+    with pytest.raises(ConfigError, match="range_projection"):
+        EdgeDistance().spec(data)
+    with pytest.raises(ConfigError, match="clip, drop"):
+        RangeProjection(fov_policy="keep")
+    with pytest.raises(ConfigError, match="needs the input `points`"):
+        RangeProjection().spec(DataSpec())
