@@ -73,12 +73,19 @@ class PerceptionModel(nn.Module):
             result = self.component(step)(**arguments, **self._special(step, batch))
             replaced = step.replaces
             predicted[replaced[0].producer if replaced else step.id] = result
-        return [self._result(predicted, batch, number) for number in range(len(batch))]
+        taps = {name: outputs[name].tap for name in self._tapped()}
+        return [self._result(predicted, taps, batch, number) for number in range(len(batch))]
 
-    def _result(self, predicted: dict[str, Any], batch: Batch, number: int) -> FrameResult:
+    def _tapped(self) -> set[str]:
+        """The heads whose tap a metric asks for."""
+        refs = [ref for step in self.plan.of("metric") for taken in step.takes.values() for ref in taken]
+        return {ref.producer for ref in refs if ref.item == "tap"}
+
+    def _result(self, predicted: dict[str, Any], taps: dict[str, Any], batch: Batch, number: int) -> FrameResult:
         predictions = {name: take(value, number) for name, value in predicted.items()}
         inputs = {name: take(value, number) for name, value in batch.inputs.items()}
-        return FrameResult(batch.meta[number], predictions, None, take(batch.targets, number), inputs)
+        own = {name: take(tap, number) for name, tap in taps.items()}
+        return FrameResult(batch.meta[number], predictions, None, take(batch.targets, number), inputs, own)
 
     # wiring at run time
 
@@ -123,6 +130,8 @@ class PerceptionModel(nn.Module):
     def _value(self, ref: Ref, outputs: dict[str, Any], predicted: dict[str, Any] | None) -> Any:
         if predicted is not None and ref.item == "value" and ref.producer in predicted:
             return predicted[ref.producer]
+        if ref.item == "tap" and f"{ref.producer}.tap" in outputs:  # of a finished frame
+            return outputs[f"{ref.producer}.tap"]
         value = outputs[ref.producer]
         if ref.item == "output":
             return value
@@ -162,6 +171,7 @@ class PerceptionModel(nn.Module):
     def _from_result(self, step: Step, result: FrameResult) -> dict[str, Any]:
         found: dict[str, Any] = {f"data.{name}": value for name, value in result.inputs.items()}
         found |= result.predictions
+        found |= {f"{name}.tap": tap for name, tap in result.taps.items()}
         found |= {step.id: result.tracks for step in self.plan.of("tracker")}
         arguments = {p.name: self._argument(step, p, found, found) for p in step.declared.takes}
         if "targets" in step.declared.special:

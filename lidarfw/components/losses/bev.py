@@ -36,10 +36,10 @@ def windows(cell: Tensor, radius: Tensor, height: int, width: int) -> tuple[Tens
     return owner[inside], place[inside]
 
 
-def footprints(boxes: Boxes, grid: Grid, stride: int) -> tuple[Tensor, Tensor]:
-    """Cells whose centre lies in the footprint of a box, and the cell of each box centre.
+def footprints(boxes: Boxes, grid: Grid, stride: int, centers: bool = True) -> tuple[Tensor, Tensor]:
+    """Cells whose centre lies in the footprint of a box, and, with `centers`, the cell of each box centre.
 
-    Returns box number and cell (P, 2) column, row; a cell may come twice.
+    Returns box number and cell (P, 2) column, row; a cell may come for several boxes.
     """
     _, height, width = grid.shape(stride)
     pixel = grid.pixel(boxes.center[:, :2], stride)
@@ -50,5 +50,7 @@ def footprints(boxes: Boxes, grid: Grid, stride: int) -> tuple[Tensor, Tensor]:
     offset = (place + 0.5 - pixel[owner]) * size
     cos, sin = boxes.yaw[owner].cos(), boxes.yaw[owner].sin()
     local = torch.stack([cos * offset[:, 0] + sin * offset[:, 1], cos * offset[:, 1] - sin * offset[:, 0]], 1)
-    covered = (local.abs() <= boxes.size[owner, :2] / 2).all(1) | (place == cell[owner]).all(1)
+    covered = (local.abs() <= boxes.size[owner, :2] / 2).all(1)
+    if centers:
+        covered = covered | (place == cell[owner]).all(1)
     return owner[covered], place[covered]

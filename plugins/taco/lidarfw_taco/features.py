@@ -67,8 +67,8 @@ def _at(bev: BEV, batch: Tensor, xy: Tensor) -> Tensor:
         return bev.features[batch, :, row, column].float()
 
     right, up = share[:, :1], share[:, 1:]
-    below = look(low[:, 0], low[:, 1]) * (1 - right) + look(high[:, 0], low[:, 1]) * right
-    above = look(low[:, 0], high[:, 1]) * (1 - right) + look(high[:, 0], high[:, 1]) * right
+    below: Tensor = look(low[:, 0], low[:, 1]) * (1 - right) + look(high[:, 0], low[:, 1]) * right
+    above: Tensor = look(low[:, 0], high[:, 1]) * (1 - right) + look(high[:, 0], high[:, 1]) * right
     return below * (1 - up) + above * up
 
 

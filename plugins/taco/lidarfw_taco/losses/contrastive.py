@@ -119,8 +119,7 @@ class IDCL(Loss):
         batch = boxes.batch[rows] if self.scope == "sample" else torch.zeros_like(rows)
         samples = detection.batch_size if self.scope == "sample" else 1
         return {
-            "nce": nothing
-            + motion_contrast(vectors, boxes.label[rows], moving[rows], batch, samples, self.temperature)
+            "nce": nothing + motion_contrast(vectors, boxes.label[rows], moving[rows], batch, samples, self.temperature)
         }
 
 

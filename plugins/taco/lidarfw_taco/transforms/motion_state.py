@@ -35,7 +35,8 @@ class MotionState(Transform):
     The speed of an object is, in this order: its labelled velocity; the distance over ground between its sightings
     `reach` seconds before and after, by its track id; the same for boxes without ids, which are matched from frame to
     frame within their class, by distance over ground in the plane (the assignment of least total distance, up to
-    3 m + 15 m/s). Where a track begins or ends, one side alone counts. An object seen for less than 0.2 s is unknown.
+    3 m + 15 m/s). Where a track begins or ends, one side alone counts; where frames are farther apart than `reach`, the
+    next ones do. An object seen for less than 0.2 s is unknown.
 
     One second of sightings and not two consecutive scans, since labels jitter: 0.05 m are 1.4 m/s at 20 Hz, and parked
     cars would move. Comes before transforms that drop boxes. Needs poses, unless the boxes have velocities.
@@ -69,7 +70,9 @@ class MotionState(Transform):
         from rich.progress import track
 
         sequences = dataset.sequences()
-        found = [self._label(dataset, s) for s in track(sequences, "working out what moves", disable=len(sequences) < 2)]
+        found = [
+            self._label(dataset, s) for s in track(sequences, "working out what moves", disable=len(sequences) < 2)
+        ]
         arrays = {f"{place}": np.concatenate([*states, np.zeros(0, np.int8)]) for place, states in enumerate(found)}
         counts = {f"count_{place}": np.array([len(s) for s in states]) for place, states in enumerate(found)}
         with atomic_path(self._path(dataset)) as temporary:
@@ -94,7 +97,7 @@ class MotionState(Transform):
             self._states = found
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
-        """The frame with the state of its boxes, and of its tracks' boxes."""
+        """The frame with the states of its boxes."""
         boxes = frame.targets.boxes
         if boxes is None or self._dataset is None:
             return frame
@@ -198,16 +201,20 @@ def _by_speed(speed: Array, limit: float) -> State:
 def speeds(place: Array, time: Array, track: npt.NDArray[np.int64], reach: float) -> Array:
     """Speed (N,) over ground in m/s of every sighting: places (N, 2) in the map, seconds (N,), track ids (N,).
 
-    The distance between the first and the last sighting of the track within `reach` seconds, over the time between
-    them; NaN where that is less than SHORTEST.
+    The distance between the first and the last sighting of the track within `reach` seconds, but at least the ones
+    next to it, over the time between them; NaN where that is less than SHORTEST.
     """
+    if not len(time):
+        return np.zeros(0)
     order = np.lexsort((time, track))
     _, number = np.unique(track[order], return_inverse=True)
-    clock = time[order] - time.min(initial=math.inf) if len(time) else time[order]
-    key = number * (2 * (clock.max(initial=0) + reach) + 1) + clock  # tracks one after the other
-    slack = 1e-6 + 1e-9 * np.abs(key).max(initial=0)
-    first = np.searchsorted(key, key - reach - slack, "left")
-    last = np.searchsorted(key, key + reach + slack, "right") - 1
+    clock = time[order] - time.min()
+    key = number * (2 * (clock.max() + reach) + 1) + clock  # tracks one after the other
+    slack = 1e-6 + 1e-9 * key.max()
+    own = np.arange(len(key))
+    start, end = np.searchsorted(number, number, "left"), np.searchsorted(number, number, "right") - 1
+    first = np.minimum(np.searchsorted(key, key - reach - slack, "left"), np.maximum(own - 1, start))
+    last = np.maximum(np.searchsorted(key, key + reach + slack, "right") - 1, np.minimum(own + 1, end))
     span = clock[last] - clock[first]
     distance = np.linalg.norm(place[order][last] - place[order][first], axis=1)
     speed = np.full(len(time), math.nan)

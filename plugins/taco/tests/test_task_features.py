@@ -1,0 +1,101 @@
+"""Metric task_features: what the contrastive losses change."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from lidarfw.assembly import build, plan
+from lidarfw.config import compose
+from lidarfw.testing.synthetic import SyntheticDataset
+from lidarfw.types import BEV, Boxes, Grid, Spec, Targets, collate, take
+
+from lidarfw_taco.metrics.task_features import TaskFeatures, neighbors
+
+GRID = Grid((0.0, 0.0, -2.0), (8.0, 8.0, 2.0), (1.0, 1.0, 1.0))
+SPEC = Spec(BEV, 2, 1, GRID)
+
+
+def bev(*samples: dict[tuple[int, int], list[float]]) -> BEV:
+    features = torch.zeros(len(samples), 2, 8, 8)
+    for number, cells in enumerate(samples):
+        for (column, row), vector in cells.items():
+            features[number, :, row, column] = torch.tensor(vector)
+    return BEV(features, GRID)
+
+
+def boxes(*rows: tuple[float, float, int, int]) -> Boxes:
+    """At x, y, of class and motion state."""
+    tensor = torch.tensor([[x, y, 0.0, 0.9, 0.9, 1.5, 0.0] for x, y, _, _ in rows]).view(-1, 7)
+    made = Boxes.from_tensor(tensor, torch.tensor([label for *_, label, _ in rows], dtype=torch.long))
+    return made.replace(moving=torch.tensor([state for *_, state in rows], dtype=torch.int8))
+
+
+def figures(*frames: tuple[BEV, BEV, Boxes | None], top: int = 2) -> dict[str, float]:
+    metric = TaskFeatures(SPEC, SPEC, top=top)
+    for detection, localization, found in frames:
+        metric.update(detection, localization, Targets(found))
+    return metric.compute()
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method")
+def test_golden():
+    detection = bev({(1, 1): [1, 0], (3, 3): [0, 1]})
+    # the strongest two: a parked car's cell, and one elsewhere; outside of objects: (6, 6) and (7, 7)
+    localization = bev({(3, 3): [9, 0], (6, 6): [3, 4], (7, 7): [1, 0]})
+    found = figures((detection, localization, boxes((1.5, 1.5, 0, 1), (3.5, 3.5, 0, 0))))
+    assert found["cross_task_cosine"] == pytest.approx((0.6 + 0.8 + 1 + 0) / 4)
+    assert found["parked_share"] == pytest.approx(0.5)
+    assert found["parked_area"] == pytest.approx(1 / 3)
+    assert found["frames"] == 1
+    without = figures((detection, localization, None), (detection, localization, boxes()))
+    assert without == {
+        "cross_task_cosine": 0,
+        "parked_share": 0,
+        "parked_area": 0,
+        "neighbor_accuracy": 0,
+        "frames": 0,
+    } | {"parked_area": without["parked_area"]}
+
+
+def test_neighbors_count_only_where_there_is_a_choice():
+    moving = [([1.0, 0.0], 0, 1), ([0.0, 1.0], 1, 1)]
+    static = [([0.9, 0.1], 0, 0)]
+    vectors, labels, states = (torch.tensor(column) for column in zip(*(*moving, *static), strict=True))
+    batch = torch.zeros(3, dtype=torch.long)
+    # the static car chooses between the moving car (nearest) and the moving pedestrian; the others have no choice
+    assert [int(v) for v in neighbors(vectors, labels, states, batch)] == [1, 1]
+    assert [int(v) for v in neighbors(vectors.flip(1), labels, states, batch)] == [1, 1]
+    assert [int(v) for v in neighbors(vectors[[1, 0, 2]], labels, states, batch)] == [0, 1]
+    assert [int(v) for v in neighbors(vectors, labels, torch.tensor([1, -1, 0]), batch)] == [0, 0]
+
+
+def test_frames_and_batches_count_alike():
+    generator = torch.Generator().manual_seed(0)
+    maps = [BEV(torch.rand(3, 2, 8, 8, generator=generator), GRID) for _ in range(2)]
+    rows = [boxes((1.5, 2.5, 0, 1), (3.5, 3.5, 1, 0), (5.5, 6.5, 0, 0)) for _ in range(3)]
+    batched = figures((*maps, Boxes.cat(rows, as_batch=True)), top=8)
+    alone = figures(*((take(maps[0], i), take(maps[1], i), rows[i]) for i in range(3)), top=8)
+    assert batched == pytest.approx(alone)
+    assert batched["frames"] == 3
+
+
+def test_a_metric_may_ask_for_the_taps_of_heads():
+    """In an evaluation each frame carries the taps that its metrics ask for, and no others."""
+    overrides = [
+        "dataset.synthetic.frames=4", "dataset.synthetic.pose=true", "backbone=pillars_small", "neck=bev_fpn_small",
+        "head=[center,scene_coord_bev]", "head.center.channels=16", "head.scene_coord_bev.tap_channels=16",
+        "head.scene_coord_bev.hidden=16", "metric=[box_ap,task_features]",
+    ]  # fmt: skip
+    model = build(plan(compose(overrides))).eval()
+    dataset = SyntheticDataset(frames=3, sequence_length=3, pose=True, points=2048)
+    with torch.no_grad():
+        results = model.predict(collate([dataset[index] for index in range(3)]))
+    assert set(results[0].taps) == {"head.center", "head.scene_coord_bev"}
+    assert results[2].taps["head.center"].features.shape[0] == 1
+    model.update_metrics(results)
+    found = model.compute_metrics()
+    assert found["task_features/frames"] > 0
+    assert 0 < found["task_features/cross_task_cosine"] <= 1
+    plain = build(plan(compose([*overrides[:-1], "metric=box_ap"]))).eval()
+    with torch.no_grad():
+        assert plain.predict(collate([dataset[0]]))[0].taps == {}
