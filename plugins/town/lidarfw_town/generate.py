@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -203,12 +203,6 @@ def _chunks(places: list[Place], workers: int) -> list[list[Place]]:
     return [places[start : start + size] for start in range(0, len(places), size)]
 
 
-@functools.lru_cache(maxsize=1)
-def _world(seed: int) -> World:
-    return World(seed)
-
-
-@functools.lru_cache(maxsize=1)
 def drive_of(job: Job, number: int) -> Drive:
     """The drive of that number of a set."""
     layout = LAYOUTS[job.layout]
@@ -217,15 +211,28 @@ def drive_of(job: Job, number: int) -> Drive:
         traversal += layout.traversal(job.split, number)
     else:  # the towns of the splits and of neighbouring seeds differ
         seed += number + (500 if job.split != "train" else 0)
+    return _drive(
+        seed, _LEAD + job.per_drive * job.step, job.sensor, traversal, job.weather, layout.compensated, layout.one_town
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def _drive(seed: int, steps: int, sensor: str, traversal: int, weather: str, compensated: bool, circuit: bool) -> Drive:
+    """Made once for all of its frames, whatever their layout."""
     return Drive(
-        seed, _LEAD + job.per_drive * job.step, LIDARS[job.sensor], traversal=traversal, weather=job.weather,
-        compensated=layout.compensated, circuit=layout.one_town, world=_world(seed),
+        seed, steps, LIDARS[sensor], traversal=traversal, compensated=compensated, weather=weather, circuit=circuit,
+        world=_world(seed),
     )  # fmt: skip
+
+
+@functools.lru_cache(maxsize=1)
+def _world(seed: int) -> World:
+    return World(seed)
 
 
 def make_frame(job: Job, place: Place) -> None:
     """Make one frame and write its files; its note comes last, so that an interrupted frame is made again."""
-    drive = drive_of(replace(job, root=""), place.drive)  # where the files go does not change the town
+    drive = drive_of(job, place.drive)
     frame = drive.frame(_LEAD + place.index * job.step)
     part = job.writer().write(frame, drive, place)
     write_text(job.part(place), json.dumps(part))

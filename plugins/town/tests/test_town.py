@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lidarfw import kitti
-from lidarfw.components.datasets.kitti import KittiDataset
-from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
-from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
-from lidarfw.errors import ConfigError, DataError
+from lidarfw.types import Camera
 from PIL import Image
 from scipy.spatial import cKDTree
 
 from lidarfw_town import statistics
 from lidarfw_town.__main__ import main
 from lidarfw_town.bodies import KINDS, make
-from lidarfw_town.camera import Pinhole, kitti_camera
+from lidarfw_town.camera import kitti_camera
 from lidarfw_town.drive import Drive, TownFrame
-from lidarfw_town.generate import Job, drive_of, generate
+from lidarfw_town.generate import Job, generate
 from lidarfw_town.layouts import labels_of
-from lidarfw_town.sensors import LIDARS, first_hits
+from lidarfw_town.render import photograph
+from lidarfw_town.sensors import LIDARS
 
 STEPS = 40
 PEOPLE_AND_VEHICLES = {10, 13, 18, 30, 31, 32, 252, 253, 254, 255, 257, 258}
@@ -44,61 +40,6 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Job:
     job = Job("kitti", str(tmp_path_factory.mktemp("kitti")), seed=3, frames=2, sensor="small", picture_width=310)
     generate(job, quiet=True)
     return job
-
-
-def hashes(root: str) -> dict[str, str]:
-    files = sorted(path for path in Path(root).rglob("*") if path.is_file())
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def test_same_seed_gives_the_same_files(written: Job, tmp_path: Path) -> None:
-    drive_of.cache_clear()
-    again = Job("kitti", str(tmp_path), seed=3, frames=2, sensor="small", picture_width=310)
-    generate(again, quiet=True)
-    assert hashes(again.root) == hashes(written.root)
-    scan = (tmp_path / "training/velodyne/000000.bin").read_bytes()
-    assert scan != (tmp_path / "training/velodyne/000001.bin").read_bytes()
-
-
-def test_an_interrupted_run_goes_on(written: Job) -> None:
-    before = hashes(written.root)
-    root = Path(written.root)
-    last = written.places()[-1]
-    for path in (written.part(last), written.part(last).with_name("done"), root / "training/velodyne/000001.bin"):
-        path.unlink()
-    first = (root / "training/velodyne/000000.bin").stat().st_mtime_ns
-    generate(written, quiet=True)
-    assert hashes(written.root) == before
-    assert (root / "training/velodyne/000000.bin").stat().st_mtime_ns == first
-
-
-def test_another_seed_is_refused_in_the_same_folder(written: Job) -> None:
-    with pytest.raises(DataError, match="seed: 3 there, 4 now"):
-        generate(Job("kitti", written.root, seed=4, frames=2, sensor="small", picture_width=310), quiet=True)
-
-
-@pytest.mark.parametrize("wrong", [{"sensor": "vlp16"}, {"frames": 0}, {"weather": "snow"}])
-def test_wrong_settings_are_named(wrong: dict[str, object], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        generate(Job("kitti", str(tmp_path), **wrong))  # type: ignore[arg-type]
-    assert not list(tmp_path.iterdir())
-
-
-def test_the_command_reports_errors_plainly(written: Job, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--out", written.root, "--frames", "5", "--seed", "3", "--sensor", "small"]) == 2
-    assert "other settings" in capsys.readouterr().err
-
-
-def test_the_core_loader_reads_the_files(written: Job) -> None:
-    dataset = KittiDataset(root=written.root, split="train", image=True)
-    dataset.prepare()
-    frame = dataset[1]
-    boxes = frame.targets.boxes
-    assert len(dataset) == 2
-    assert boxes is not None
-    assert len(boxes)
-    assert len(frame.inputs["points"]) > 1000
-    assert float(frame.inputs["points"].features.max()) <= 1
 
 
 def inside(points: np.ndarray, box: tuple[float, ...], margin: float) -> np.ndarray:
@@ -195,12 +136,9 @@ def _covered(shown: tuple[float, ...], label: kitti.Label, *, whole: bool) -> fl
     return share
 
 
-def _pictured(drive: Drive, frame: TownFrame, camera: Pinhole) -> dict[int, tuple[float, ...]]:
+def _pictured(drive: Drive, frame: TownFrame, camera: Camera) -> dict[int, tuple[float, ...]]:
     """Instance -> left, top, right, bottom of its pixels."""
-    directions = np.ascontiguousarray(camera.rays().reshape(-1, 3) @ frame.pose[:3, :3].T.astype(np.float32))
-    place = (frame.pose[:3, :3] @ camera.place + frame.pose[:3, 3]).astype(np.float32)
-    origins = np.ascontiguousarray(np.broadcast_to(place, directions.shape))
-    instance = first_hits([drive.still, frame.movers], origins, directions).instance.reshape(camera.height, -1)
+    instance = photograph(drive, frame, camera).instance
     found = {}
     for number in np.unique(instance[instance > 0]):
         rows, columns = np.nonzero(instance == number)
@@ -281,43 +219,3 @@ def test_the_picture_shows_the_town(tmp_path: Path) -> None:
         pixels = np.asarray(picture.convert("RGB"))
     assert pixels.shape[1] == 1600
     assert pixels.std() > 30
-
-
-@pytest.fixture(scope="module")
-def tracked(tmp_path_factory: pytest.TempPathFactory) -> Job:
-    root = str(tmp_path_factory.mktemp("tracking"))
-    job = Job("kitti_tracking", root, seed=1, frames=3, sensor="small", picture_width=0, stride=5)
-    generate(job, quiet=True)
-    return job
-
-
-def test_tracking_files_keep_ids_and_places(tracked: Job) -> None:
-    folder = Path(tracked.root) / "training"
-    rows = [line.split() for line in (folder / "label_02/0000.txt").read_text().splitlines()]
-    oxts = np.loadtxt(folder / "oxts/0000.txt")
-    ids = [{row[1] for row in rows if row[0] == str(frame) and row[2] != "DontCare"} for frame in range(3)]
-    assert oxts.shape == (3, 30)
-    assert all(len(row) == 17 for row in rows)
-    assert ids[0] & ids[1] & ids[2]
-    assert (folder / "calib/0000.txt").read_text().count("\n") == 7
-
-
-def test_the_core_loader_of_tracking_reads_the_places(tracked: Job) -> None:
-    dataset = KittiTrackingDataset(root=tracked.root, split="all")
-    dataset.prepare()
-    loaded = np.stack([dataset[number].targets.poses.matrix[0].double().numpy() for number in range(3)])
-    steps = 10 + 5 * np.arange(3.0)
-    wanted = drive_of(replace(tracked, root=""), 0).poses(steps)
-    relative, expected = (np.linalg.inv(poses[0]) @ poses for poses in (loaded, wanted))
-    assert np.linalg.norm(expected[2, :3, 3]) > 1
-    assert relative == pytest.approx(expected, abs=0.01)
-
-
-def test_the_core_loader_of_semantic_kitti_reads_scans_and_labels(tmp_path: Path) -> None:
-    job = Job("semantic_kitti", str(tmp_path), seed=1, frames=2, sensor="small", picture_width=0)
-    generate(job, quiet=True)
-    dataset = SemanticKittiDataset(root=str(tmp_path), split="all", task="moving")
-    dataset.prepare()
-    frame = dataset[1]
-    assert len(frame.targets.points.label) == len(frame.inputs["points"])
-    assert {0, 1} <= set(frame.targets.points.label.tolist())

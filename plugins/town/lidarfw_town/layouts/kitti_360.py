@@ -22,7 +22,7 @@ _FULL = 1400  # pixels of a fisheye picture of the real rig; its perspective pic
 _BEGIN = datetime(2013, 5, 28, 8, 46)
 # the LiDAR in the vehicle, whose frame is x ahead, y right, z down
 LIDAR_TO_VEHICLE = np.array([[1.0, 0, 0, 0.775], [0, -1, 0, 0.3], [0, 0, -1, -0.83], [0, 0, 0, 1]])
-_SKY = 23
+_OWN, _SKY = 1, 23
 _LABELS = {  # SemanticKITTI's classes -> KITTI-360's, which are those of Cityscapes
     10: 26, 11: 33, 13: 28, 15: 32, 18: 27, 30: 24, 31: 25, 32: 25, 40: 7, 44: 9, 48: 8, 49: 6, 50: 11, 51: 13, 52: 12,
     60: 7, 70: 21, 71: 21, 72: 22, 80: 17, 81: 20,
@@ -73,11 +73,7 @@ class Kitti360Layout(Layout):
         write_png(self.root / "data_2d_raw" / drive / name / kind / file, shot.image)
         depth = np.minimum(np.round(shot.depth * 256), 2**16 - 1).astype(np.uint16)
         write_png(self.root / "data_2d_depth" / drive / name / file, depth)
-        table = np.zeros(2**16, np.uint8)
-        table[list(_LABELS)] = list(_LABELS.values())
-        table[0] = _SKY
-        imaged = rays_of(camera)[1].any(1).reshape(shot.semantic.shape)
-        semantic = np.where(imaged, table[shot.semantic], 0).astype(np.uint8)
+        semantic = labels_of(shot, rays_of(camera)[1].any(1).reshape(shot.depth.shape))
         write_png(self.root / "data_2d_semantics" / "train" / drive / name / "semantic" / file, semantic)
 
     def finish(self, parts: Sequence[Sequence[dict[str, Any]]]) -> None:
@@ -105,6 +101,14 @@ class Kitti360Layout(Layout):
             camera = cameras[name]
             text = _YAML.format(name=name, camera=camera, distortion=camera.distortion, lens=camera.intrinsics)
             write_text(folder / f"{name}.yaml", text)
+
+
+def labels_of(shot: Rendering, imaged: np.ndarray) -> np.ndarray:
+    """Classes (H, W) of a picture in KITTI-360's ids; `imaged` says which pixels the lens reaches."""
+    table = np.zeros(2**16, np.uint8)
+    table[list(_LABELS)] = list(_LABELS.values())
+    nothing = np.where(shot.depth > 0, _OWN, np.where(imaged, _SKY, 0))
+    return np.where(shot.semantic == 0, nothing, table[shot.semantic]).astype(np.uint8)
 
 
 def rig(width: int) -> dict[str, Camera]:

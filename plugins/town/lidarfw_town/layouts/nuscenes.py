@@ -88,16 +88,17 @@ class NuScenesLayout(Layout):
 
 
 def cameras(width: int) -> dict[str, Camera]:
-    """The six cameras around the vehicle, 0.5 m from the LiDAR and 0.3 m below it; the one behind sees widest."""
+    """The six cameras: around the LiDAR, and the one that looks back and widest at the tail."""
     found = {}
     for channel, degrees in _YAWS.items():
-        focal, yaw = width * (0.5 if degrees == 180 else 0.79), math.radians(degrees)
+        focal, reach, drop = (0.5, 2.7, 0.7) if degrees == 180 else (0.79, 0.5, 0.3)
+        yaw = math.radians(degrees)
         ahead, right = np.array([math.cos(yaw), math.sin(yaw), 0]), np.array([math.sin(yaw), -math.cos(yaw), 0])
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, [0, 0, -1], ahead], 1)
-        pose[:3, 3] = 0.5 * ahead - (0, 0, 0.3)
+        pose[:3, 3] = reach * ahead - (0, 0, drop)
         height = round(width * 9 / 16)
-        lens = (focal, focal, (width - 1) / 2, (height - 1) / 2)
+        lens = (focal * width, focal * width, (width - 1) / 2, (height - 1) / 2)
         found[channel] = Camera("pinhole", width, height, lens).transformed(pose)
     return found
 
@@ -194,7 +195,7 @@ class _Scene:
             nearest = samples[int(np.abs(times - frame["time"]).argmin())]["token"]
             for channel, file in frame["files"].items():
                 width, height = (0, 0) if channel == LIDAR else (self.width, round(self.width * 9 / 16))
-                own = token("sample_data", file)
+                own = token("sample_data", self.name, file)
                 links = {"token": own, "sample_token": nearest, "ego_pose_token": own}
                 links |= {"calibrated_sensor_token": token("calibrated_sensor", channel), "timestamp": frame["time"]}
                 what = {"fileformat": file.rpartition(".")[2].replace("bin", "pcd"), "is_key_frame": frame["key"]}
