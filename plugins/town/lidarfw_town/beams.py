@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lidarfw_town.mesh import Array, Mesh
-from lidarfw_town.sensors import Floats, Hits, Lidar, Scene
+from lidarfw_town.sensors import Floats, Hits, Lidar, Scene, unit
 
 Rows = npt.NDArray[np.int64]
 
@@ -43,8 +43,8 @@ class Body:
         cosine, sine = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
-    def meet(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32]]:
-        """Distance (N,), 1e37 for none, and triangle (N,), -1 for none, of rays of the world."""
+    def meet(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32], Floats]:
+        """`Scene.cast` for rays of the world; the normals are in the frame of the body."""
         turn = self.turn.astype(np.float32)
         near = (origins - np.array(self.place)).astype(np.float32)
         return _ready(self.mesh).cast(np.ascontiguousarray(near @ turn), np.ascontiguousarray(directions @ turn))
@@ -92,7 +92,9 @@ def _rows(lidar: Lidar, right: float, left: float, down: float, up: float) -> Ro
     return (beams[:, None] * lidar.columns + columns[: lidar.columns]).ravel()
 
 
-def merge(hits: Hits, body: Body, rows: Rows, distance: Floats, triangle: npt.NDArray[np.int32]) -> None:
+def merge(
+    hits: Hits, body: Body, rows: Rows, distance: Floats, triangle: npt.NDArray[np.int32], normal: Floats
+) -> None:
     """Put the hits on a body, at rows, before what stands behind it."""
     nearer = (triangle >= 0) & (distance < hits.distance[rows])
     rows, triangle = rows[nearer], triangle[nearer]
@@ -100,4 +102,4 @@ def merge(hits: Hits, body: Body, rows: Rows, distance: Floats, triangle: npt.ND
     for name in ("semantic", "reflectance"):
         getattr(hits, name)[rows] = getattr(body.mesh, name)[triangle]
     hits.instance[rows] = body.id
-    hits.normal[rows] = body.mesh.normals[triangle] @ body.turn.T
+    hits.normal[rows] = unit(normal[nearer]) @ body.turn.T

@@ -163,10 +163,10 @@ class Drive:
         for thing, body, _, _ in bodies:
             rows = windows[body.id]
             if isinstance(thing, Mover) or (hits.instance[rows] == body.id).any():
-                distance, triangle = body.meet(origins[rows], directions[rows])
+                distance, triangle, normal = body.meet(origins[rows], directions[rows])
                 beams[body.id] = int((triangle >= 0).sum())
                 if isinstance(thing, Mover):
-                    merge(hits, body, rows, distance, triangle)
+                    merge(hits, body, rows, distance, triangle, normal)
         return hits, beams
 
     def _passed(self, state: Array, pose: Array) -> float:

@@ -6,7 +6,7 @@ The unit of light is what a white surface sends back in full sun.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -14,11 +14,11 @@ import numpy.typing as npt
 
 from lidarfw_town.beams import Body
 from lidarfw_town.mesh import Array
-from lidarfw_town.sensors import Scene
+from lidarfw_town.sensors import Scene, Weather
 
 Colour = tuple[float, float, float]
 
-WEATHER = {"clear": 0.0, "rain": 0.003, "fog": 0.015, "night": 0.0}  # extinction of a LiDAR's beams per metre
+WEATHER = {"clear": Weather(), "rain": Weather(0.003, wet=True), "fog": Weather(0.015), "night": Weather()}
 
 _PER_BOX = 12  # triangles: every lamp is a box
 _STREET_POWER, _HEADLIGHT_POWER = 30.0, 600.0
@@ -87,7 +87,9 @@ def _rainy(light: Light) -> Light:
 
 def _foggy(light: Light) -> Light:
     grey, white = _clouded(light, 0.97), (0.76, 0.78, 0.80)
-    return replace(grey, zenith=white, horizon=white, air=white, haze=0.028, lamps=0.3, wet=True)
+    return replace(
+        grey, zenith=white, horizon=white, air=white, haze=0.028, exposure=light.exposure * 0.9, lamps=0.3, wet=True
+    )
 
 
 def _dark(light: Light) -> Light:
@@ -97,14 +99,15 @@ def _dark(light: Light) -> Light:
     return replace(dark, exposure=light.exposure * 1.6, grain=0.012)
 
 
-_IN = {"clear": lambda light: light, "rain": _rainy, "fog": _foggy, "night": _dark}
+_IN: dict[str, Callable[[Light], Light]] = {"clear": lambda light: light, "rain": _rainy, "fog": _foggy, "night": _dark}
 
 
 @dataclass(frozen=True, eq=False)
 class Lamps:
     """Lamps: places (L, 3) in the world, axes (L, 3), power (L, 3) RGB, narrowness of the beam (L,), near range (L,).
 
-    At d metres, off the axis by an angle a, a lamp gives power * cos(a) ** narrow / max(d, near) ** 2: the lens of a headlight spreads the light that falls close by.
+    At d metres, off the axis by an angle a, a lamp gives power * cos(a) ** narrow / max(d, near) ** 2; the lens of a
+    headlight spreads what falls close by.
     """
 
     place: Array

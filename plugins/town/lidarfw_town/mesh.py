@@ -72,17 +72,18 @@ class Mesh:
         return len(self.triangles)
 
     @functools.cached_property
-    def normals(self) -> npt.NDArray[np.float32]:
-        """Unit normals (T, 3); 0 for a triangle without area."""
-        a, b, c = self.triangles[:, 0], self.triangles[:, 1], self.triangles[:, 2]
-        cross = np.cross(b - a, c - a)
-        length = np.linalg.norm(cross, axis=1, keepdims=True)
-        return np.asarray(cross / np.maximum(length, 1e-12), np.float32)
-
-    @functools.cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Lowest and highest x, y, z."""
         return self.triangles.min((0, 1)).astype(np.float64), self.triangles.max((0, 1)).astype(np.float64)
+
+    @functools.cached_property
+    def panes(self) -> npt.NDArray[np.int64]:
+        """Numbers (T,) of the windows of houses, each of two triangles that follow each other; -1 for all else."""
+        glass = (self.semantic == GLASS.semantic) & (self.reflectance < 0.08)
+        at = np.arange(len(self))
+        begins = glass & ~np.concatenate([[False], glass[:-1]])
+        first = np.maximum.accumulate(np.where(begins, at, 0))
+        return np.where(glass, first + (at - first) // 2, -1)
 
     def placed(self, x: float, y: float, z: float, yaw: float) -> Mesh:
         """The mesh turned by `yaw` about z and moved."""

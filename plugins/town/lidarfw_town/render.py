@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from lidarfw_town.bodies import make
 from lidarfw_town.camera import rays_of
 from lidarfw_town.light import Lamps, Light, lamps_of, light_of
 from lidarfw_town.mesh import Array
-from lidarfw_town.sensors import Floats, Scene, cast, surfaces
+from lidarfw_town.sensors import Floats, Scene, cast, surfaces, unit
 
 if TYPE_CHECKING:
     from lidarfw_town.drive import Drive, TownFrame
@@ -65,7 +65,9 @@ def photograph(drive: Drive, frame: TownFrame, camera: Camera) -> Rendering:
     spot = [round(1000 * value) for value in rays_of(camera)[0].tolist()]
     rng = np.random.default_rng((drive.seed, 7, drive.traversal, frame.number, *(abs(2 * s) + (s < 0) for s in spot)))
     light = light_of(drive.seed, drive.traversal, drive.weather)
-    lamps = lamps_of(drive.still, frame.bodies, frame.pose, drive.lidar.height) if light.lamps else None
+    # by day, lamps can be seen, but they light nothing
+    dark = light.direct == 0
+    lamps = lamps_of(drive.still, frame.bodies, frame.pose, drive.lidar.height) if dark else None
     scenes = [drive.still, frame.movers, _own(frame, drive.lidar.height)]
     return render(scenes, camera, frame.pose, light, rng, lamps)
 
@@ -73,6 +75,7 @@ def photograph(drive: Drive, frame: TownFrame, camera: Camera) -> Rendering:
 def _own(frame: TownFrame, height: float) -> Scene:
     """The own vehicle, of no class."""
     body = make("car", _OWN_SEED).fitted(4.6, 1.8, _OWN_ROOF).with_semantic(0)
+    body = replace(body, colour=body.colour * np.float32(0.35))
     return Scene(body.moved(frame.pose[:3, :3], frame.pose[:3, :3] @ (-_OWN_BEHIND, 0, -height) + frame.pose[:3, 3]))
 
 
@@ -83,17 +86,17 @@ def render(
     """A picture of scenes. `pose` (4, 4) is that of the LiDAR, in whose frame the camera is given, in the world."""
     place, rays, scale = rays_of(camera)
     origin = (pose[:3, :3] @ place + pose[:3, 3]).astype(np.float32)
-    near = lamps.within(origin) if lamps else None
+    near = lamps.within(origin.astype(np.float64)) if lamps else None
     size, count = (camera.height, camera.width), len(rays)
     colour, depth = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     semantic, instance = np.zeros(count, np.uint16), np.zeros(count, np.int32)
     for start in range(0, count, _BLOCK):
         rows = start + np.flatnonzero(rays[start : start + _BLOCK].any(1))
         directions = np.ascontiguousarray(rays[rows] @ pose[:3, :3].T.astype(np.float32))
-        distance, index = cast(scenes, np.tile(origin, (len(rows), 1)), directions)
+        distance, index, normal = cast(scenes, np.tile(origin, (len(rows), 1)), directions)
         colour[rows] = _sky(directions, light)
         met = np.flatnonzero(index >= 0)
-        seen = _seen(scenes, origin, directions[met], distance[met], index[met], light)
+        seen = _seen(scenes, origin, directions[met], distance[met], index[met], unit(normal[met]), light)
         colour[rows[met]] = _through_air(_shade(seen, scenes, light, near), seen.distance, light)
         depth[rows[met]] = seen.distance * scale[rows[met]]
         semantic[rows[met]], instance[rows[met]] = seen.semantic, surfaces(scenes, index[met], "instance")
@@ -103,26 +106,23 @@ def render(
 
 
 def _seen(
-    scenes: Sequence[Scene], origin: Floats, along: Floats, distance: Floats, index: npt.NDArray[np.int64], light: Light
-) -> _Seen:
-    normal = surfaces(scenes, index, "normals")
+    scenes: Sequence[Scene], origin: Floats, along: Floats, distance: Floats, index: npt.NDArray[np.int64],
+    normal: Floats, light: Light,
+) -> _Seen:  # fmt: skip
     normal = np.where((normal * along).sum(1, keepdims=True) > 0, -normal, normal)
     place = origin + along * distance[:, None] + normal * 0.01
     semantic, reflectance, colour, glow = (
         surfaces(scenes, index, name) for name in ("semantic", "reflectance", "colour", "glow")
     )
-    glow = glow + _lit_windows(semantic, reflectance, index, normal)
-    return _Seen(place, normal, along, distance, semantic, reflectance, colour, glow * np.float32(light.lamps))
+    if light.lamps:
+        glow = (glow + _lit_windows(surfaces(scenes, index, "panes"))) * np.float32(light.lamps)
+    return _Seen(place, normal, along, distance, semantic, reflectance, colour, glow)
 
 
-def _lit_windows(
-    semantic: npt.NDArray[np.uint16], reflectance: Floats, index: npt.NDArray[np.int64], normal: Floats
-) -> Floats:
-    """Light behind some windows. A window is two triangles, one after the other."""
-    pane = (semantic == 50) & (reflectance < 0.08)
-    # both triangles of a window have one number, whichever of them has the even place
-    draw = np.modf(np.abs(np.sin((index // 2 + 0.5) * 12.9898 + normal[:, 0])) * 43758.5453)[0]
-    return np.asarray(np.where(pane & (draw < 0.25), 0.45, 0.0), np.float32)
+def _lit_windows(panes: npt.NDArray[np.int64]) -> Floats:
+    """Light behind a quarter of the windows."""
+    draw = np.modf(np.abs(np.sin(panes * 12.9898)) * 43758.5453)[0]
+    return np.asarray(np.where((panes > 0) & (draw < 0.25), 0.45, 0.0), np.float32)
 
 
 def _through_air(colour: Array, distance: Floats, light: Light) -> Array:
@@ -137,10 +137,11 @@ def _shade(seen: _Seen, scenes: Sequence[Scene], light: Light, lamps: Lamps | No
     albedo = seen.colour**1.6 * _texture(seen.place, seen.semantic)[:, None] * np.where(wet, 0.55, 1.0)
     lit = _sunlight(seen, scenes, light) + (0.30 + 0.14 * seen.normal[:, 2:]) * np.array(light.ambient)
     if lamps:
-        lit = lit + _lamplight(seen, scenes, lamps) * light.lamps
+        lit = lit + _lamplight(seen, scenes, lamps)
     # what a surface glows in is its own colour, a window's the yellow of a room
     room = np.where((seen.semantic == 50)[:, None], np.array([1.0, 0.78, 0.45]), seen.colour)
-    return np.asarray(albedo * lit + seen.glow[:, None] * room + _gloss(seen, wet, light))
+    glow = seen.glow[:, None] * room if light.lamps else 0.0
+    return np.asarray(albedo * lit + glow + _gloss(seen, wet, light))
 
 
 def _gloss(seen: _Seen, wet: npt.NDArray[np.bool_], light: Light) -> Array:
@@ -185,7 +186,7 @@ def _blocked(
     scenes: Sequence[Scene], origins: Floats, directions: Floats, reach: Floats | None = None
 ) -> npt.NDArray[np.bool_]:
     """Whether something stands in the way of rays (N, 3), within a reach (N,) in metres or at all."""
-    distance, index = cast(scenes, np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions))
+    distance, index, _ = cast(scenes, np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions))
     return np.asarray(index >= 0) if reach is None else np.asarray(distance < reach)
 
 

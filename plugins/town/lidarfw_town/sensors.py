@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -59,6 +60,7 @@ LIDARS = {
 }
 
 
+_ROADS = (40, 44, 60)
 _ROUGH = (70, 71, 72)  # vegetation, trunks, terrain: matt at every incidence, and not quite where their triangles are
 
 
@@ -71,12 +73,13 @@ class Scene:
         if len(mesh):
             TriangleMesh(self._scene, mesh.triangles)
 
-    def cast(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32]]:
-        """Distance (N,), 1e37 for none, and triangle (N,), -1 for none, of the first hits of unit rays."""
+    def cast(self, origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int32], Floats]:
+        """First hits of unit rays: distance (N,), 1e37 for none; triangle (N,), -1 for none; a normal (N, 3)."""
         if not len(self.mesh):
-            return np.full(len(origins), 1e37, np.float32), np.full(len(origins), -1, np.int32)
+            count = len(origins)
+            return np.full(count, 1e37, np.float32), np.full(count, -1, np.int32), np.zeros((count, 3), np.float32)
         found = self._scene.run(origins, directions, query="INTERSECT", output=1)
-        return found["tfar"], found["primID"]
+        return found["tfar"], found["primID"], found["Ng"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,23 +93,29 @@ class Hits:
     normal: Floats
 
 
-def cast(scenes: Sequence[Scene], origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int64]]:
-    """Distance (N,), 1e37 for none, and triangle (N,), counted through all scenes, -1 for none, of the first hits."""
-    distance, triangle = scenes[0].cast(origins, directions)
+def cast(scenes: Sequence[Scene], origins: Floats, directions: Floats) -> tuple[Floats, npt.NDArray[np.int64], Floats]:
+    """First hits in several scenes: distance, triangle, counted through all scenes, and a normal of any length."""
+    distance, triangle, normal = scenes[0].cast(origins, directions)
     start, index = len(scenes[0].mesh), triangle.astype(np.int64)
     for scene in scenes[1:]:
-        other, triangle = scene.cast(origins, directions)
-        nearer = (triangle >= 0) & (other < distance)
-        distance, index = np.where(nearer, other, distance), np.where(nearer, triangle + start, index)
+        other, triangle, across = scene.cast(origins, directions)
+        rows = np.flatnonzero((triangle >= 0) & (other < distance))
+        distance[rows], index[rows], normal[rows] = other[rows], triangle[rows] + start, across[rows]
         start += len(scene.mesh)
-    return distance, index
+    return distance, index, normal
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (N, 3) at length 1; those of length 0 stay."""
+    square = np.einsum("ij,ij->i", vectors, vectors)
+    return np.asarray(vectors / np.sqrt(np.maximum(square, 1e-20))[:, None], np.float32)
 
 
 def first_hits(scenes: Sequence[Scene], origins: Floats, directions: Floats) -> Hits:
     """The nearest hits of rays (N, 3) in several scenes."""
-    distance, index = cast(scenes, origins, directions)
-    names = ("semantic", "instance", "reflectance", "normals")
-    return Hits(distance, *(surfaces(scenes, index, name) for name in names))
+    distance, index, normal = cast(scenes, origins, directions)
+    semantic, instance, reflectance = (surfaces(scenes, index, n) for n in ("semantic", "instance", "reflectance"))
+    return Hits(distance, semantic, instance, reflectance, unit(normal))
 
 
 def surfaces(scenes: Sequence[Scene], index: npt.NDArray[np.int64], name: str) -> npt.NDArray[Any]:
@@ -130,47 +139,77 @@ class Scan:
     instance: npt.NDArray[np.int32]
 
 
-def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generator, weather: float = 0.0) -> Scan:
+@dataclass(frozen=True)
+class Weather:
+    """What the air does to beams: extinction per metre by rain or fog; whether roads are wet."""
+
+    extinction: float = 0.0
+    wet: bool = False
+
+
+def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generator, weather: Weather) -> Scan:
     """What the LiDAR measures of the hits of its rays, beam by beam.
 
     The signal falls with the square of the range and the cosine of incidence; weak pulses are lost, and the rest is
-    given with noise. At edges a beam meets two surfaces and may measure a place between them; such points have the
-    class 1 (outlier) and belong to no object. `weather` is the extinction of rain or fog, per metre.
+    given with noise. At edges a beam meets two surfaces and may measure a place between them; drops of rain and fog
+    may send back more than what stands behind them. Such points have the class 1 (outlier) and belong to no object.
     """
     shape = (len(lidar.elevations), lidar.columns)
-    cosine = np.abs((hits.normal * directions).sum(1))
-    reach = np.minimum(hits.distance, 1e3)
-    signal = (
-        hits.reflectance * np.maximum(cosine, 0.01) * np.exp(-2 * weather * reach) / np.maximum(reach / 30, 0.15) ** 2
-    )
-    lost = rng.random(len(signal)) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
-    glassy = (hits.reflectance < 0.045) & (rng.random(len(signal)) < 0.55)
-    gone = lost | glassy | (hits.distance > lidar.farthest) | _own_roof(lidar.rays()[0].reshape(-1, 3))
-    noise = lidar.noise * np.where(np.isin(hits.semantic, _ROUGH), 2.0, 1.0)
-    distance = hits.distance + (rng.normal(0, 1, len(signal)) * noise).astype(np.float32)
-    distance = np.where(gone, 0, distance).reshape(shape).astype(np.float32)
-    mixed = _mix(distance, rng)
-    semantic = np.where(mixed, 1, hits.semantic.reshape(shape)).astype(np.uint16)
+    rough = np.isin(hits.semantic, _ROUGH)
+    cosine = np.abs(np.einsum("ij,ij->i", hits.normal, directions))
+    signal = _signal(hits, cosine, weather)
+    roof = _own_roof(lidar)
+    drops = np.where(roof, 0, _drops(signal, hits.distance, weather.extinction, rng))
+    lost = rng.random(len(signal), np.float32) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
+    glassy = (hits.reflectance < 0.045) & (rng.random(len(signal), np.float32) < 0.55)
+    gone = lost | glassy | roof | (hits.distance > lidar.farthest)
+    noise = rng.standard_normal(len(signal), np.float32) * (lidar.noise * np.where(rough, 2.0, 1.0))
+    distance = np.where(gone, 0, hits.distance + noise).astype(np.float32).reshape(shape)
+    mixed = _mix(distance, rng).ravel() | (drops > 0)
     return Scan(
-        distance,
-        _remission(hits, cosine, rng).reshape(shape),
-        semantic,
-        np.where(mixed, 0, hits.instance.reshape(shape)),
+        np.where(drops > 0, drops, distance.ravel()).astype(np.float32).reshape(shape),
+        np.where(drops > 0, 0.02, _remission(hits, cosine, rough, rng)).astype(np.float32).reshape(shape),
+        np.where(mixed, 1, hits.semantic).astype(np.uint16).reshape(shape),
+        np.where(mixed, 0, hits.instance).reshape(shape),
     )
 
 
-def _remission(hits: Hits, cosine: Floats, rng: np.random.Generator) -> Floats:
+def _signal(hits: Hits, cosine: Floats, weather: Weather) -> Floats:
+    """Strength of the pulses (N,), 1 for a white surface 30 m away. Water on roads mirrors them away."""
+    reach = np.minimum(hits.distance, np.float32(1e3))
+    spread = np.maximum(reach / 30, 0.15) ** 2  # devices turn down what is closer than 4.5 m
+    signal = hits.reflectance * np.maximum(cosine, 0.01) / spread * np.exp(-2 * weather.extinction * reach)
+    return np.asarray(np.where(np.isin(hits.semantic, _ROADS), 0.4, 1.0) * signal if weather.wet else signal)
+
+
+def _drops(signal: Floats, distance: Floats, extinction: float, rng: np.random.Generator) -> Floats:
+    """Ranges (N,) at which drops send more back than the surface behind them, 0 where they do not.
+
+    The stronger of two echoes counts, as with dual-return devices set to strongest (cf. Hahner et al., "Fog simulation
+    on real LiDAR point clouds for 3D object detection in adverse weather", ICCV 2021). How often a beam meets a clump
+    of drops and how much that sends back grow with the extinction.
+    """
+    count = len(signal)
+    if not extinction:
+        return np.zeros(count, np.float32)
+    met = rng.random(count, np.float32) < 1 - np.exp(-10 * extinction)
+    near = 1 + 4 * rng.standard_exponential(count, np.float32)
+    echo = 4 * extinction * rng.standard_exponential(count, np.float32)
+    echo *= np.exp(-2 * extinction * near) / np.maximum(near / 30, 0.15) ** 2
+    return np.asarray(np.where(met & (near < distance) & (echo > signal), near, 0), np.float32)
+
+
+def _remission(hits: Hits, cosine: Floats, rough: npt.NDArray[np.bool_], rng: np.random.Generator) -> Floats:
     """Calibrated remission as KITTI's scans have it; 0 where the pulse was faint.
 
     The device makes up for the range as far as 25 m. Smooth surfaces are weaker at grazing incidence. Dark paint and
     far roads give 0.
     """
-    rough = np.isin(hits.semantic, _ROUGH)
     grazing = np.where(rough, 1.0, cosine / (cosine + 0.03))
     far = np.minimum(1.0, 25.0 / np.maximum(hits.distance, 1.0)) ** 1.2
-    value = hits.reflectance * grazing * far * rng.normal(1, 0.15, len(cosine))
-    faint = value < rng.normal(0.1, 0.03, len(cosine))
-    faint |= (rng.random(len(cosine)) < 0.04) & ~rough  # seen at all ranges
+    value = hits.reflectance * grazing * far * (1 + np.float32(0.15) * rng.standard_normal(len(cosine), np.float32))
+    faint = value < 0.1 + np.float32(0.03) * rng.standard_normal(len(cosine), np.float32)
+    faint |= (rng.random(len(cosine), np.float32) < 0.04) & ~rough  # seen at all ranges
     # levels of a hundredth, as the devices give them
     return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)
 
@@ -184,8 +223,10 @@ def _mix(distance: Floats, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
     return np.asarray(mixed)
 
 
-def _own_roof(directions: Floats) -> npt.NDArray[np.bool_]:
-    """Rays, in the axes of the sensor, that the own roof stops: 0.45 m below, 0.55 m to each side."""
+@functools.lru_cache(maxsize=8)
+def _own_roof(lidar: Lidar) -> npt.NDArray[np.bool_]:
+    """Rays (beams * columns,) that the own roof stops: 0.45 m below, 0.55 m to each side."""
+    directions = lidar.rays()[0].reshape(-1, 3)
     down = np.minimum(directions[:, 2], -1e-6)
     ahead, aside = -0.45 * directions[:, 0] / down, -0.45 * directions[:, 1] / down
     return np.asarray((ahead < 1.2) & (ahead > -1.4) & (np.abs(aside) < 0.55))
