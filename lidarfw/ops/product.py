@@ -39,7 +39,7 @@ def multiply(rows: Tensor, weight: Tensor, out: Tensor) -> None:
 @functools.cache
 def _onednn_is_faster() -> bool:
     """Whether the processor has AVX-512 and is not Intel's, and torch has oneDNN."""
-    if torch.backends.cpu.get_cpu_capability() != "AVX512" or not torch.backends.mkldnn.is_available():
+    if torch.backends.cpu.get_cpu_capability() != "AVX512" or not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
         return False
     cpuinfo = Path("/proc/cpuinfo")
     known = cpuinfo.exists() and "GenuineIntel" not in cpuinfo.read_text()
