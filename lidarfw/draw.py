@@ -18,7 +18,7 @@ from torch import Tensor
 from lidarfw.errors import DataError
 from lidarfw.files import atomic_path
 from lidarfw.ops import box_corners
-from lidarfw.types import Boxes, Camera, PointLabels, Points, RangeImage, Tracks
+from lidarfw.types import Boxes, Camera, PointLabels, Points, Poses, RangeImage, Tracks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -233,6 +233,81 @@ def _legend(axes: Axes, labels: Tensor | None, truth: Boxes | None, classes: Seq
     if handles:
         place: Any = {"loc": "upper left", "bbox_to_anchor": (1.01, 1), "borderaxespad": 0}
         axes.legend(handles=handles, fontsize=11, frameon=False, **place)
+
+
+# Trajectories
+
+
+def trajectory(found: Poses, truth: Tensor | None = None, background: Tensor | None = None, title: str = "") -> Picture:
+    """Estimated poses on the map, x to the right and y up, in metres; the true path as a line.
+
+    Each pose is a dot in the colour of its distance to the true one (the scale ends at the 95th percentile), with a
+    thin line to where it should be; poses that are not ok are grey crosses.
+
+    Args:
+        found: of all frames, in order.
+        truth: (N, 4, 4) true poses of the same frames; without them the dots have one colour.
+        background: (P, 3) points of the map.
+        title: a line above.
+    """
+    places, ok = found.matrix[:, :2, 3].detach().cpu().numpy(), found.ok.cpu().numpy()
+    true = None if truth is None else truth[:, :2, 3].detach().cpu().numpy()
+    shown = [places[ok] if ok.any() else places, *([] if true is None else [true])]
+    figure, axes = _map_axes(np.concatenate(shown))
+    if background is not None:
+        xy = background[:, :2].detach().cpu().numpy()
+        axes.scatter(xy[:, 0], xy[:, 1], s=_dot(len(xy)), c="#C8C8C8", linewidths=0, zorder=1, rasterized=True)
+    if true is None or truth is None:
+        axes.scatter(places[ok, 0], places[ok, 1], s=14, c=COLOURS[0], linewidths=0, zorder=4, label="estimated")
+    else:
+        _beside_truth(figure, axes, found, truth)
+    failed = places[~ok]
+    if len(failed):
+        axes.scatter(failed[:, 0], failed[:, 1], marker="x", s=24, c="#777777", zorder=3, label="no pose found")
+    axes.legend(fontsize=10, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1), borderaxespad=0)
+    axes.set_title(title, loc="left", fontsize=12)
+    return _render(figure)
+
+
+def _map_axes(places: npt.NDArray[np.float64]) -> tuple[Figure, Axes]:
+    """Axes to scale around places (N, 2) of the map."""
+    low, high = places.min(0) - 15, places.max(0) + 15
+    size = high - low
+    scale = min(10 / size[0], 9 / size[1])
+    margin, right = 0.7, 2.4
+    width, height = float(size[0] * scale), float(size[1] * scale)
+    whole = (margin + width + right, 2 * margin + height)
+    figure = _figure(*whole)
+    axes = figure.add_axes((margin / whole[0], margin / whole[1], width / whole[0], height / whole[1]))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor="#FBFBFA")
+    axes.set_xlabel("x (m)", fontsize=11)
+    axes.set_ylabel("y (m)", fontsize=11)
+    axes.grid(True, color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _beside_truth(figure: Figure, axes: Axes, found: Poses, truth: Tensor) -> None:
+    """The true path, the estimates that are ok by their error, and a colour bar."""
+    from matplotlib.collections import LineCollection
+
+    ok = found.ok.cpu().numpy()
+    places, true = found.matrix[:, :3, 3].detach().cpu().numpy()[ok], truth[:, :3, 3].detach().cpu().numpy()
+    apart = np.linalg.norm(places - true[ok], axis=1)
+    axes.plot(true[:, 0], true[:, 1], ".", markersize=3, color=_TRUTH, zorder=2, label="true")
+    links: Any = np.stack([places[:, :2], true[ok, :2]], 1)
+    axes.add_collection(LineCollection(links, colors="#D55E00", linewidths=0.8, zorder=3))
+    farthest = max(float(np.percentile(apart, 95)), 0.1) if len(apart) else 1.0
+    dots = axes.scatter(
+        places[:, 0], places[:, 1], s=18, c=apart, cmap="viridis_r", vmin=0, vmax=farthest, linewidths=0, zorder=4,
+        label="estimated",
+    )  # fmt: skip
+    box = axes.get_position()
+    bar = figure.add_axes(
+        (box.x1 + 0.25 / figure.get_figwidth(), box.y0, 0.12 / figure.get_figwidth(), box.height * 0.5)
+    )
+    figure.colorbar(dots, cax=bar, extend="max").set_label("position error (m)", fontsize=10)
 
 
 # Camera view

@@ -14,15 +14,31 @@ import numpy as np
 import torch
 
 from lidarfw import draw, kitti
-from lidarfw.assembly import make_transforms
-from lidarfw.errors import DataError
+from lidarfw.assembly import make_dataset, make_transforms
+from lidarfw.components.datasets.drives import read_table
+from lidarfw.errors import ConfigError, DataError
 from lidarfw.files import atomic_path, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
 from lidarfw.model import PerceptionModel
-from lidarfw.types import Boxes, Camera, Frame, FrameMeta, FrameResult, Grid, Image, PointLabels, Points, Spec, Targets
+from lidarfw.ops import transform
+from lidarfw.types import (
+    Boxes,
+    Camera,
+    Frame,
+    FrameMeta,
+    FrameResult,
+    Grid,
+    Image,
+    PointLabels,
+    Points,
+    Poses,
+    Spec,
+    Targets,
+)
 
 PERIOD = 0.1  # seconds between the scans of a folder, where nothing says otherwise
 FORMATS = ("json", "npz", "kitti")
+_SHOWN = 400  # points of a scan in the picture of a trajectory
 
 
 @dataclass(frozen=True)
@@ -119,8 +135,8 @@ class FrameReader:
             elif spec.kind is Image and (picture is not None or name in self.needed):
                 inputs[name] = _image(source, spec, picture, cameras)
         frame = Frame(inputs, Targets(), meta)
-        for transform in self.transforms:
-            frame = transform(frame, np.random.default_rng(0))
+        for change in self.transforms:
+            frame = change(frame, np.random.default_rng(0))
         self._check_inputs(source, frame)
         return frame
 
@@ -191,6 +207,27 @@ def _image(source: Source, spec: Spec, picture: draw.Picture | None, cameras: di
     return Image(canvas, (camera.cropped(0, 0, *size),))
 
 
+class SplitFrames(Sequence[Frame]):
+    """The frames of a split of the dataset that a model learned from, with their truth, after its transforms."""
+
+    def __init__(self, model: PerceptionModel, split: str) -> None:
+        config = model.plan.config
+        if not config.get("dataset"):
+            raise ConfigError("the checkpoint names no dataset, so it has no splits\n  fix: give scans instead")
+        self.dataset = make_dataset(config, config.get("splits", {}).get(split, split))
+        self.dataset.prepare()
+        self.transforms = make_transforms(config, training=False)
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
+        frame = self.dataset[range(len(self))[index]]
+        for change in self.transforms:
+            frame = change(frame, np.random.default_rng(0))
+        return frame
+
+
 # Through the model
 
 
@@ -202,9 +239,19 @@ def predict(
     With `stream` the sources are one sequence, `PERIOD` apart: filters keep their state and the tracker follows
     objects; without, every one stands for itself.
     """
-    running = model.stream()
+    return predict_frames(model, read_frames(reader, sources, stream), stream)
+
+
+def read_frames(reader: FrameReader, sources: Iterable[Source], stream: bool = False) -> Iterator[Frame]:
+    """The frames of the sources; with `stream` they are one sequence."""
     for index, source in enumerate(sources):
-        frame = reader.read(source, "sequence", index) if stream else reader.read(source)
+        yield reader.read(source, "sequence", index) if stream else reader.read(source)
+
+
+def predict_frames(model: PerceptionModel, frames: Iterable[Frame], stream: bool = False) -> Iterator[FrameResult]:
+    """Results in order of the frames, on the CPU; with `stream` frames of one sequence follow each other."""
+    running = model.stream()
+    for frame in frames:
         for result in [*running.step(frame), *([] if stream else running.flush())]:
             yield _on_cpu(result)
     for result in running.flush():
@@ -359,6 +406,77 @@ def pictures_of(
     if camera is not None and picture is not None and found is not None:
         pictures["image"] = draw.camera_view(picture, camera, found, truth, classes)
     return pictures
+
+
+class Trajectory:
+    """The poses of many results, for one picture on the map.
+
+    `background` (P, 3) are points of the map; without them a few points of every scan stand in, put where the scan's
+    pose says.
+    """
+
+    def __init__(self, background: torch.Tensor | None = None) -> None:
+        self.background = background
+        self.found: list[Poses] = []
+        self.truth: list[torch.Tensor] = []
+        self._scans: list[torch.Tensor] = []
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def add(self, result: FrameResult, truth: torch.Tensor | None = None) -> None:
+        """Take in a result that has a pose; `truth` (4, 4) where the result itself does not know it."""
+        poses = next((value for value in result.predictions.values() if isinstance(value, Poses)), None)
+        if poses is None:
+            return
+        self.found.append(poses)
+        known = result.targets.poses if result.targets is not None else None
+        truth = known.matrix[0] if known is not None and bool(known.ok[0]) else truth
+        self.truth += [] if truth is None else [truth]
+        scan = next((value for value in result.inputs.values() if isinstance(value, Points)), None)
+        if self.background is None and scan is not None and bool(poses.ok[0]):
+            thinned = scan.xyz[:: max(len(scan) // _SHOWN, 1)]
+            self._scans.append(transform(poses.matrix[0].to(thinned.dtype), thinned))
+
+    def errors(self) -> torch.Tensor | None:
+        """(N, 2) metres and degrees, inf where no pose was found; None unless the truth of every frame is known."""
+        if len(self.truth) != len(self.found) or not self.found:
+            return None
+        from lidarfw.components.metrics.pose_error import pose_errors
+
+        found = self._poses()
+        errors = pose_errors(found.matrix, torch.stack(self.truth))
+        return torch.where(found.ok[:, None], errors, torch.inf)
+
+    def summary(self) -> str:
+        """Median errors in a line, or how many poses were found."""
+        errors, found = self.errors(), self._poses()
+        text = f"{int(found.ok.sum())} of {len(self)} poses found"
+        if errors is None:
+            return text
+        metres, degrees = errors.sort(0).values[(len(errors) - 1) // 2].tolist()
+        return f"{text}, median error {metres:.2f} m, {degrees:.2f} degrees"
+
+    def picture(self) -> draw.Picture:
+        """All poses on the map, coloured by their error where the truth is known."""
+        background = self.background
+        if background is None and self._scans:
+            background = torch.cat(self._scans)
+        truth = torch.stack(self.truth) if self.errors() is not None else None
+        return draw.trajectory(self._poses(), truth, background, self.summary())
+
+    def _poses(self) -> Poses:
+        return Poses(*(torch.cat([getattr(p, n) for p in self.found]) for n in ("matrix", "ok", "confidence")))
+
+
+def read_poses(path: Path, count: int) -> torch.Tensor:
+    """(N, 4, 4) poses of a file with the 12 numbers of a 3 x 4 matrix in each line (KITTI's form), one per scan."""
+    table = read_table(path, 12)
+    if len(table) != count:
+        raise DataError(f"{path}: has {len(table)} poses for {count} scans; one line per scan is needed")
+    matrix = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    matrix[:, :3] = torch.from_numpy(table).view(-1, 3, 4)
+    return matrix
 
 
 def _picture_of(result: FrameResult) -> draw.Picture | None:

@@ -6,17 +6,25 @@ import argparse
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from lidarfw.predict import Source
-    from lidarfw.types import FrameResult
+    from lidarfw.model import PerceptionModel
+    from lidarfw.predict import FrameReader
+    from lidarfw.types import Frame, FrameResult
+
+T = TypeVar("T")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw predict`."""
     parser.add_argument("checkpoint", metavar="CKPT", help="of `lidarfw train`; nothing else is needed")
-    parser.add_argument("scans", metavar="SCAN", nargs="+", help=".bin .pcd .ply .npy .npz .png .jpg, or a folder")
+    parser.add_argument("scans", metavar="SCAN", nargs="*", help=".bin .pcd .ply .npy .npz .png .jpg, or a folder")
+    parser.add_argument(
+        "--split", metavar="NAME", help="instead of scans: a split of the dataset it learned from, with the truth"
+    )
+    parser.add_argument("--poses", metavar="FILE", type=Path, help="true poses, 12 numbers a line and scan, to compare")
+    parser.add_argument("--map", metavar="FILE", type=Path, help="points of the map, behind the trajectory")
     parser.add_argument("-o", "--output", metavar="DIR", default="predictions", help="folder to write to (%(default)s)")
     parser.add_argument("--format", choices=("json", "npz", "kitti"), default="json", help="of results (%(default)s)")
     parser.add_argument("--calib", metavar="FILE", type=Path, help="KITTI calibration; in KITTI's layout it is found")
@@ -36,37 +44,62 @@ def run(args: argparse.Namespace) -> int:
     import torch
 
     import lidarfw
-    from lidarfw import predict
+    from lidarfw import draw, predict
+    from lidarfw.io import read_points
 
     model = lidarfw.load(Path(args.checkpoint)).to("cuda" if torch.cuda.is_available() else "cpu")
     reader = predict.FrameReader(model, args.columns, args.repair, args.intensity_max)
-    sources = predict.find_sources(args.scans, reader.lidar, args.calib, args.image)
-    if model.plan.data.sweeps > 1:
+    frames, count = _frames(args, model, reader)
+    if model.plan.data.sweeps > 1 and not args.split:
         print(f"note: the model learned from {model.plan.data.sweeps} scans per frame, here each frame is one scan")
+    truth = predict.read_poses(args.poses, count) if args.poses else None
+    path = predict.Trajectory(None if args.map is None else torch.from_numpy(read_points(args.map).xyz))
     classes, extent, folder = model.plan.data.classes, predict.extent_of(model), Path(args.output)
     rows = []
     begin = time.perf_counter()
-    for result in predict.predict(model, reader, _with_progress(sources), args.stream):
+    for number, result in enumerate(predict.predict_frames(model, frames, args.stream)):
         seconds = time.perf_counter() - begin
         shown = predict.keep_scores(result, args.score)
         predict.save(shown, folder, args.format, classes)
         if not args.no_pictures:
             predict.save_pictures(shown, folder, classes, extent)
+        path.add(shown, None if truth is None else truth[number])
         rows.append(_row(shown, classes, seconds))
         begin = time.perf_counter()
     _print_table(rows, reader.left_out, folder)
+    if len(path):
+        print(path.summary())
+        if not args.no_pictures:
+            draw.write_png(folder / "trajectory.png", path.picture())
     return 0
 
 
-def _with_progress(sources: Sequence[Source]) -> Iterator[Source]:
-    """The sources, with a progress bar on the terminal where they are many."""
-    if len(sources) < 3:
-        yield from sources
+def _frames(args: argparse.Namespace, model: PerceptionModel, reader: FrameReader) -> tuple[Iterator[Frame], int]:
+    """What to predict, as it is needed, and how many that are."""
+    from lidarfw import predict
+    from lidarfw.errors import ConfigError
+
+    if bool(args.scans) == bool(args.split):
+        raise ConfigError(
+            "predict takes scans or --split, one of them\n"
+            "  fix: lidarfw predict model.ckpt scans/, or lidarfw predict model.ckpt --split val"
+        )
+    if args.split:
+        split = predict.SplitFrames(model, args.split)
+        return (split[index] for index in _with_progress(range(len(split)))), len(split)
+    sources = predict.find_sources(args.scans, reader.lidar, args.calib, args.image)
+    return predict.read_frames(reader, _with_progress(sources), args.stream), len(sources)
+
+
+def _with_progress(items: Sequence[T]) -> Iterator[T]:
+    """The items, with a progress bar on the terminal where they are many."""
+    if len(items) < 3:
+        yield from items
         return
     from rich.console import Console
     from rich.progress import track
 
-    yield from track(sources, "predict", console=Console(stderr=True), transient=True)
+    yield from track(items, "predict", console=Console(stderr=True), transient=True)
 
 
 def _row(result: FrameResult, classes: Sequence[str], seconds: float) -> list[str]:

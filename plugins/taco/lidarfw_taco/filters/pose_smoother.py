@@ -143,4 +143,4 @@ def _turn(rotation: Tensor) -> Tensor:
     sine = skew.norm()
     angle = torch.atan2(sine, (rotation.diagonal().sum() - 1) / 2)
     scale = 1.0 if float(sine) < 1e-12 else float(angle / sine)
-    return skew * scale
+    return scale * skew

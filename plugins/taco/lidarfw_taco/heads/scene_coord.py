@@ -16,7 +16,7 @@ from lidarfw.ops import find_voxels, scatter_mean, to_dense, transform
 from lidarfw.types import BEV, Points, Poses, Record, SceneCoords, Spec, Targets, Voxels
 from torch import Tensor, nn
 
-TARGETS = ("absolute", "shift")
+TARGETS = ("absolute", "shift", "affine")
 CALIBRATION = 100  # training batches that set origin and scale
 
 
@@ -44,14 +44,14 @@ class CoordinateRegressor(nn.Module):
         super().__init__()
         if target not in TARGETS:
             raise ConfigError(f"scene_coord: target is {target!r}.\n  fix: target: {' or '.join(TARGETS)}")
-        self.shift = target == "shift"
+        self.target = target
         self.convs = nn.Sequential(
             nn.Linear(in_channels, hidden, bias=False), BatchNorm1d(hidden), nn.LeakyReLU(),
             nn.Linear(hidden, hidden, bias=False), BatchNorm1d(hidden),
         )  # fmt: skip
         self.shortcut = nn.Sequential(nn.Linear(in_channels, hidden, bias=False), BatchNorm1d(hidden))
         self.bottleneck = nn.Linear(hidden, tap_channels)
-        self.last = nn.Linear(tap_channels, 3)
+        self.last = nn.Linear(tap_channels, 12 if target == "affine" else 3)
         self.register_buffer("origin", torch.zeros(3))
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("batches", torch.zeros((), dtype=torch.long))
@@ -61,8 +61,11 @@ class CoordinateRegressor(nn.Module):
         hidden = nn.functional.leaky_relu(self.convs(features) + self.shortcut(features))
         tap = nn.functional.relu(self.bottleneck(hidden))
         with torch.autocast(tap.device.type, enabled=False):  # metres in 16 bit are off by half a metre at 100 m
-            world = self.origin + self.scale * self.last(tap.float())
-        return (world + source if self.shift else world), tap
+            values = self.last(tap.float())
+            world = self.origin + self.scale * values[:, :3]
+            if self.target == "affine":
+                world = world + (values[:, 3:].view(-1, 3, 3) @ source[:, :, None])[:, :, 0]
+        return (world + source if self.target == "shift" else world), tap
 
     @torch.no_grad()
     def calibrate(self, source: Tensor, batch: Tensor, poses: Poses | None) -> None:
@@ -74,7 +77,7 @@ class CoordinateRegressor(nn.Module):
         if not len(source):
             return
         wanted = transform(poses.matrix.to(source.dtype)[batch], source[:, None])[:, 0]
-        wanted = wanted - source if self.shift else wanted
+        wanted = wanted - source if self.target == "shift" else wanted
         self.batches += 1
         self.origin += (wanted.mean(0) - self.origin) / self.batches
         spread = (wanted - self.origin).abs().mean().clamp(min=1.0)
@@ -84,10 +87,11 @@ class CoordinateRegressor(nn.Module):
 class SceneCoordHead(Head):
     """Map coordinates of every voxel (TACO, section 4): the pairs from which `pose_ransac` finds the pose.
 
-    A pair is the mean of the points in a voxel (sensor frame) and its predicted place in the map. With `target`
-    absolute the network says that place itself; with shift it says the difference, as SGLoc and LiSA do, which is
-    better where the heading hardly varies. The tap is the input of the last layer, `tap_channels` wide and not
-    negative, as a map with the maximum over z. Voxels without a point give no pair.
+    A pair is the mean of the points in a voxel (sensor frame) and its predicted place in the map. `target` says what
+    the last layer gives: absolute, the place itself; shift, the difference, as SGLoc and LiSA do, which is better where
+    the heading hardly varies; affine (ours), a matrix A and a vector t with the place A x + t, so that all voxels of a
+    scan can share one answer. The tap is the input of that layer, `tap_channels` wide and not negative, as a map with
+    the maximum over z. Voxels without a point give no pair.
     """
 
     defaults = {"loss": ["scene_coord"], "postprocessor": ["pose_ransac"], "metric": ["pose_error"]}
