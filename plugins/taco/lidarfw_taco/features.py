@@ -69,7 +69,8 @@ def _at(bev: BEV, batch: Tensor, xy: Tensor) -> Tensor:
     right, up = share[:, :1], share[:, 1:]
     below: Tensor = look(low[:, 0], low[:, 1]) * (1 - right) + look(high[:, 0], low[:, 1]) * right
     above: Tensor = look(low[:, 0], high[:, 1]) * (1 - right) + look(high[:, 0], high[:, 1]) * right
-    return below * (1 - up) + above * up
+    mixed: Tensor = below * (1 - up) + above * up
+    return mixed
 
 
 def occupied(bev: BEV, boxes: Boxes) -> Tensor:
@@ -100,7 +101,8 @@ def top_cells(bev: BEV, count: int, excluded: Tensor | None = None) -> tuple[Ten
 
 def unit(vectors: Tensor) -> Tensor:
     """Vectors of length 1 along the last axis; those shorter than SMALLEST stay (almost) 0."""
-    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp(min=SMALLEST)
+    norm: Tensor = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return vectors / norm.clamp(min=SMALLEST)
 
 
 def mean_similarity(cells: Tensor, valid: Tensor, objects: Tensor, batch: Tensor, mode: str = "raw") -> Tensor:
