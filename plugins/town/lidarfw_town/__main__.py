@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.picture:
             from lidarfw_town.picture import write_picture
 
-            write_picture(given.out, given.seed, LIDARS[given.sensor], given.traversal)
+            write_picture(given.out, given.seed, LIDARS[given.sensor], given.traversal, given.weather)
         else:
             generate(Job(root=given.out, **values), given.workers)
     except LidarfwError as error:

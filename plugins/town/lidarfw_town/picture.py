@@ -1,20 +1,20 @@
-"""One picture of a town: the map with the route, what the camera sees, and the scan from above and as a range image."""
+"""One picture of a town: the map with the route, and what every sensor sees."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from lidarfw.files import atomic_path
 
 from lidarfw_town.bodies import KINDS
-from lidarfw_town.camera import kitti_camera
+from lidarfw_town.camera import fisheye_cameras, kitti_camera
 from lidarfw_town.drive import Drive, TownFrame
 from lidarfw_town.mesh import Array
 from lidarfw_town.render import photograph
-from lidarfw_town.sensors import Lidar
+from lidarfw_town.sensors import Lidar, first_hits
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,26 +29,47 @@ _GROUPS = {
     "road": (40, 44, 60), "pavement": (48,), "building": (50, 51, 52), "vegetation": (70, 71), "terrain": (72,),
     "pole or sign": (80, 81, 99), "vehicle": (10, 13, 18, 252, 257, 258), "person": (30, 31, 32, 253, 254, 255),
 }  # fmt: skip
-_STEP = 160  # of the drive that is drawn
+_STEPS = 300  # of the drive
 _REACH = 42.0  # metres around the vehicle in the view from above
+_PIXEL = 0.5  # metres, of the map
+_FARTHEST = 80.0  # metres, of the colours of ranges
 
 
-def write_picture(path: str | Path, seed: int, lidar: Lidar, traversal: int = 0) -> None:
-    """Draw the town of a seed, and a moment of a drive through it, into a PNG."""
+def write_picture(path: str | Path, seed: int, lidar: Lidar, traversal: int = 0, weather: str = "clear") -> None:
+    """Draw the town of a seed, and what every sensor sees at the busiest moment of a drive through it, into a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    drive = Drive(seed, 300, lidar, traversal=traversal)
-    frame = drive.frame(_STEP)
-    figure = Figure((16, 13.4), dpi=100, facecolor="white", layout="constrained")
+    drive = Drive(seed, _STEPS, lidar, traversal=traversal, weather=weather)
+    frame = drive.frame(_busiest(drive))
+    figure = Figure((16, 21.5), dpi=100, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(3, 2, height_ratios=(6.6, 4.2, 1.6))
-    _draw_map(figure.add_subplot(grid[0, 0]), drive)
-    _draw_scan(figure.add_subplot(grid[0, 1]), frame)
-    _draw_camera(figure.add_subplot(grid[1, :]), drive, frame)
-    _draw_ranges(figure.add_subplot(grid[2, :]), frame)
+    grid = figure.add_gridspec(5, 4, height_ratios=(7.6, 4.8, 2.5, 4.1, 2.0))
+    _draw_map(figure.add_subplot(grid[0, :2]), drive, frame)
+    _draw_scan(figure.add_subplot(grid[0, 2:]), frame)
+    shot = photograph(drive, frame, kitti_camera())
+    _show(figure.add_subplot(grid[1, :]), shot.image, f"camera ahead, {weather}")
+    _show(figure.add_subplot(grid[2, :2]), _shaded(shot.depth), "its depth")
+    _show(figure.add_subplot(grid[2, 2:]), colours_of(shot.semantic), "its classes")
+    left, right = (photograph(drive, frame, camera) for camera in fisheye_cameras(600).values())
+    _show(figure.add_subplot(grid[3, 0]), left.image, "fisheye to the left")
+    _show(figure.add_subplot(grid[3, 1]), right.image, "fisheye to the right")
+    _show(figure.add_subplot(grid[3, 2]), _shaded(left.depth), "depth to the left")
+    _show(figure.add_subplot(grid[3, 3]), colours_of(right.semantic), "classes to the right")
+    _show(figure.add_subplot(grid[4, :]), _shaded(frame.grid), "range image: left and right edge look backward", "auto")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
+
+
+def _busiest(drive: Drive) -> int:
+    """The step with the most objects near by."""
+    steps = np.arange(10, _STEPS - 10, 5)
+    parked = np.array([thing.pose[:2] for thing in drive.traffic.parked])
+    counts = []
+    for step, (x, y) in zip(steps, drive.traffic.ego[steps, :2]):
+        there = np.concatenate([parked, [mover.at(step)[:2] for mover in drive.traffic.movers]])
+        counts.append((np.hypot(*(there - (x, y)).T) < 30).sum())
+    return int(steps[np.argmax(counts)])
 
 
 def colours_of(semantic: npt.NDArray[np.integer]) -> Array:
@@ -59,23 +80,13 @@ def colours_of(semantic: npt.NDArray[np.integer]) -> Array:
     return np.asarray(table[np.minimum(semantic, 259)])
 
 
-def _draw_map(axes: Axes, drive: Drive) -> None:
-    """The surfaces of the town from above, highest last, the route, and where everybody is."""
-    from matplotlib.collections import PolyCollection
-
-    mesh = drive.still.mesh
-    order = np.argsort(mesh.triangles[..., 2].mean(1))
-    axes.add_collection(
-        PolyCollection(
-            list(mesh.triangles[order][..., :2]),
-            facecolors=colours_of(mesh.semantic[order]),
-            antialiased=False,
-            linewidths=0,
-        )
-    )
+def _draw_map(axes: Axes, drive: Drive, frame: TownFrame) -> None:
+    """The surfaces of the town from above, the route, and where everybody is."""
+    west, south, east, north = drive.world.land.bounds
+    axes.imshow(_from_above(drive), extent=(west, east, south, north))
     axes.plot(*drive.traffic.ego[:, :2].T, color="#C2185B", linewidth=2, label="route of half a minute")
-    axes.plot(*drive.traffic.ego[_STEP, :2], "o", color="#C2185B", markersize=7)
-    movers = np.array([(*mover.at(_STEP)[:2], mover.kind == "pedestrian") for mover in drive.traffic.movers])
+    axes.plot(*drive.traffic.ego[frame.number, :2], "o", color="#C2185B", markersize=7)
+    movers = np.array([(*mover.at(frame.number)[:2], mover.kind == "pedestrian") for mover in drive.traffic.movers])
     for chosen, colour, name in ((movers[:, 2] == 0, "#0B3D91", "vehicles"), (movers[:, 2] == 1, "#D32F2F", "people")):
         axes.plot(
             *movers[chosen, :2].T,
@@ -86,10 +97,21 @@ def _draw_map(axes: Axes, drive: Drive) -> None:
             markeredgewidth=0.4,
             label=name,
         )
-    west, south, east, north = drive.world.land.bounds
     axes.set(xlim=(west, east), ylim=(south, north), aspect="equal", xlabel="x (m)", ylabel="y (m)")
     axes.legend(loc="lower right", framealpha=0.9)
     axes.set_title(f"town of seed {drive.seed}", loc="left")
+
+
+def _from_above(drive: Drive) -> Array:
+    """Colours (H, W, 3) of the classes, north up, as light falls on them from the north-west."""
+    west, south, east, north = drive.world.land.bounds
+    x, y = np.meshgrid(np.arange(west, east, _PIXEL), np.arange(north, south, -_PIXEL))
+    origins = np.stack([x, y, np.full_like(x, 150.0)], -1).reshape(-1, 3).astype(np.float32)
+    down = np.tile(np.array([0, 0, -1], np.float32), (len(origins), 1))
+    hits = first_hits([drive.still], origins, down)
+    upward = hits.normal * np.sign(hits.normal[:, 2:])
+    light = 0.55 + 0.45 * np.clip(upward @ np.array([-0.45, 0.45, 0.77]), 0, 1) / 0.77
+    return np.asarray((colours_of(hits.semantic) * light[:, None]).clip(0, 1).reshape(*x.shape, 3))
 
 
 def _draw_scan(axes: Axes, frame: TownFrame) -> None:
@@ -121,15 +143,16 @@ def _outline(box: tuple[float, ...]) -> Array:
     return np.asarray(corners @ turn + (x, y))
 
 
-def _draw_camera(axes: Axes, drive: Drive, frame: TownFrame) -> None:
-    axes.imshow(photograph(drive, frame, kitti_camera()).image)
+def _show(axes: Axes, picture: npt.NDArray[Any], title: str, aspect: Literal["equal", "auto"] = "equal") -> None:
+    axes.imshow(picture, aspect=aspect, interpolation="antialiased")
     axes.set_axis_off()
-    axes.set_title("camera", loc="left")
+    axes.set_title(title, loc="left")
 
 
-def _draw_ranges(axes: Axes, frame: TownFrame) -> None:
-    """Ranges by beam and column; white where nothing came back."""
-    image = np.where(frame.grid > 0, np.log(np.maximum(frame.grid, 1)), np.nan)
-    axes.imshow(image, aspect="auto", cmap="turbo_r", vmin=np.log(3), vmax=np.log(80), interpolation="nearest")
-    axes.set_axis_off()
-    axes.set_title("range image: near red, far blue; left and right edge look backward", loc="left")
+def _shaded(distance: npt.NDArray[np.float32]) -> Array:
+    """Colours (H, W, 3) of metres (H, W), near red and far blue; white where there are none."""
+    from matplotlib import colormaps
+
+    low, high = np.log(3), np.log(_FARTHEST)
+    share = (np.log(np.maximum(distance, 0.1)) - low) / (high - low)
+    return np.where(distance[..., None] > 0, colormaps["turbo_r"](share.clip(0, 1))[..., :3], 1.0)

@@ -75,7 +75,7 @@ def photograph(drive: Drive, frame: TownFrame, camera: Camera) -> Rendering:
 def _own(frame: TownFrame, height: float) -> Scene:
     """The own vehicle, of no class."""
     body = make("car", _OWN_SEED).fitted(4.6, 1.8, _OWN_ROOF).with_semantic(0)
-    body = replace(body, colour=body.colour * np.float32(0.35))
+    body = replace(body, colour=body.colour * np.float32(0.2))
     return Scene(body.moved(frame.pose[:3, :3], frame.pose[:3, :3] @ (-_OWN_BEHIND, 0, -height) + frame.pose[:3, 3]))
 
 
@@ -148,9 +148,10 @@ def _gloss(seen: _Seen, wet: npt.NDArray[np.bool_], light: Light) -> Array:
     """The sky in glass, and in wet roads at grazing angles (Schlick's form of Fresnel's reflection)."""
     cosine = np.abs((seen.along * seen.normal).sum(1, keepdims=True))
     mirror = seen.along + 2 * cosine * seen.normal
-    glass = (seen.reflectance < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.25, 0, 1) * 0.4
-    film = wet * (0.04 + 0.5 * (1 - cosine) ** 5)
-    return np.asarray((glass + film) * np.array(light.horizon) * 0.9)
+    grazing = (1 - cosine) ** 5
+    glass = (seen.reflectance < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.3, 0, 1) * (0.16 + 0.7 * grazing)
+    film = wet * (0.04 + 0.5 * grazing)
+    return np.asarray((glass + film) * np.array(light.horizon))
 
 
 def _sunlight(seen: _Seen, scenes: Sequence[Scene], light: Light) -> Array:
@@ -174,7 +175,7 @@ def _lamplight(seen: _Seen, scenes: Sequence[Scene], lamps: Lamps) -> Array:
         distance = np.linalg.norm(way, axis=1)
         way /= np.maximum(distance, 1e-3)[:, None]
         facing = np.maximum(-(way * seen.normal).sum(1), 0)
-        facing = np.where(seen.semantic == 81, np.maximum(facing * (1 + 0.5 * narrow), 0), facing)
+        facing = np.where(seen.semantic == 81, facing * (1 + 0.15 * narrow), facing)
         strength = np.maximum(way @ axis.astype(np.float32), 0) ** narrow * facing / np.maximum(distance, near) ** 2
         rows = np.flatnonzero(strength * power[0] > _FAINT)
         shadow = _blocked(scenes, seen.place[rows], -way[rows], distance[rows] - 0.4)
