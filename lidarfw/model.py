@@ -114,7 +114,7 @@ class PerceptionModel(nn.Module):
     def _argument(
         self, step: Step, p: Parameter, outputs: dict[str, Any], predicted: dict[str, Any] | None = None
     ) -> Any:
-        refs = step.takes[p.name]
+        refs = [ref for ref in step.takes[p.name] if not (p.optional and _is_absent_input(ref, outputs))]
         values = [self._value(ref, outputs, predicted) for ref in refs]
         if p.form == "dict":
             return {ref.producer.partition(".")[2]: value for ref, value in zip(refs, values, strict=True)}
@@ -211,6 +211,11 @@ class PerceptionModel(nn.Module):
         for name, metric in self._metrics.items():
             return f"{name}/{metric.monitor}"
         return None
+
+
+def _is_absent_input(ref: Ref, outputs: dict[str, Any]) -> bool:
+    """Whether a frame lacks an input that its dataset gives: a scan by itself has no pose, say."""
+    return ref.producer.startswith("data.") and ref.producer not in outputs
 
 
 def _is(value: Any, kind: type) -> bool:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 
-from lidarfw.ops import range_knn, range_project, residual_images
+from lidarfw.ops import range_knn, range_knn_mean, range_match, range_project, residual_images
 from lidarfw.types import Points, RangeView
 
 VIEW = RangeView(8, 32, math.radians(20), math.radians(-25))
@@ -102,3 +102,55 @@ def test_an_even_window_is_refused() -> None:
     image = range_project(cloud(10, 1, 0), VIEW)
     with pytest.raises(ValueError, match="window must be odd"):
         range_knn(image, torch.zeros(1, 8, 32, dtype=torch.long), torch.zeros(10), window=4)
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_residuals_between_ranges_only(signed: bool) -> None:
+    now = torch.tensor([[10.0, 0.1, 0], [0.1, 20, 0], [-3, 0.1, 0], [0.1, -60, 0]])
+    image = range_project(Points.from_scan(now, now[:, :0]), VIEW)
+    past = Points.from_scan(now * torch.tensor([[0.8], [1.1], [0.5], [0.9]]), now[:, :0])
+    residual = residual_images(image, [past], nearest=2.0, farthest=50.0, signed=signed)[0, 0].flatten()
+    sign = -1 if signed else 1
+    assert residual[image.pixel].tolist() == pytest.approx([sign * 0.2, 0.1, 0, 0], abs=1e-4)
+
+
+def test_a_clipping_view_keeps_what_lies_above_and_below() -> None:
+    steep = torch.tensor([[1.0, 0, 5], [1, 0, -5], [5, 0, 0], [0, 0, 0]])
+    for clip, rows in ((False, [-1, -1, 3, -1]), (True, [0, 7, 3, -1])):
+        view = RangeView(8, 32, math.radians(20), math.radians(-25), clip)
+        pixel = range_project(Points.from_scan(steep, steep[:, :0]), view).pixel
+        assert torch.where(pixel < 0, -1, pixel // 32).tolist() == rows
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from([(3, 3), (5, 5), (5, 9)]), st.integers(0, 10**6))
+def test_means_are_over_those_that_vote(window: tuple[int, int], seed: int) -> None:
+    """A class voted for by all neighbours has mean 1 in its channel; the mean of one-hot labels counts the votes."""
+    points = cloud(300, 2, seed)
+    image = range_project(points, VIEW)
+    labels = torch.randint(3, image.mask.shape, generator=torch.Generator().manual_seed(seed))
+    distance = points.xyz.norm(dim=1)
+    size = {"window": window[0], "neighbors": window[1], "cutoff": 2.0}
+    values = torch.nn.functional.one_hot(labels, 3).permute(0, 3, 1, 2).float()
+    means, votes = range_knn_mean(image, values, distance, **size), range_knn(image, labels, distance, **size)
+    inside = image.pixel >= 0
+    assert torch.allclose(means[inside].sum(1), torch.ones(int(inside.sum())))
+    assert means[~inside].abs().sum() == 0
+    assert torch.equal(means[inside].argmax(1), votes[inside])
+    constant = range_knn_mean(image, torch.full((2, 1, 8, 32), 0.3), distance, **size)
+    assert torch.allclose(constant[inside], torch.tensor(0.3))
+
+
+def test_matching_by_range() -> None:
+    """The nearest range in the window, the nearest pixel among equals, round the border, within reach."""
+    columns, ranges = torch.tensor([0.0, 2, 4, 31]), torch.tensor([10.0, 12, 10, 20])
+    there = VIEW.direction(torch.full((4,), 3.0), columns) * ranges[:, None]
+    image = range_project(Points.from_scan(there, there[:, :0]), VIEW)
+    asked = torch.tensor([[2.0, 11.8], [2.0, 10.9], [1.0, 10.0], [3.0, 10.4], [0.0, 19.0], [16.0, 10.0]])
+    xyz = VIEW.direction(torch.full((6,), 3.0), asked[:, 0]) * asked[:, 1:]
+    found = range_match(image, xyz, 1.0, window=5)
+    place = torch.where(found < 0, -1, found % 32).tolist()
+    assert place[1] in (0, 4)  # equally near in range and in the picture
+    assert [place[i] for i in (0, 2, 3, 4, 5)] == [2, 0, 4, 31, -1]
+    assert range_match(image, xyz, 0.5, window=5).ge(0).tolist() == [True, False, True, True, False, False]
+    assert range_match(image, xyz[:0], 1.0).shape == (0,)
