@@ -111,38 +111,38 @@ class Rulebook:
         if self._blocks is None:
             starts = row_starts(self.pairs_per_output())
             number = len(self) // _BLOCK_PAIRS + 1
-            limits = torch.arange(number, device=starts.device) * _BLOCK_PAIRS
-            first_rows = torch.searchsorted(starts, limits)
-            bounds = self._bounds(first_rows).tolist()
+            first_rows = torch.searchsorted(starts, torch.arange(number, device=starts.device) * _BLOCK_PAIRS)
+            sizes = self._run_sizes(first_rows).view(-1).tolist()
+            inputs, outputs = (side.split_with_sizes(sizes) for side in (self.inputs, self.outputs))
             rows = [*first_rows.tolist(), self.num_outputs]
             self._blocks = [
-                self._block(slice(*rows[b : b + 2]), bounds[b], bounds[b + 1], starts) for b in range(number)
+                self._block(slice(*rows[b : b + 2]), inputs[b::number], outputs[b::number], sizes[b::number], starts)
+                for b in range(number)
             ]
         return self._blocks
 
     def _mirrored(self, block: Block) -> Block:
         return replace(block, elements=tuple(self.volume - 1 - element for element in block.elements))
 
-    def _bounds(self, first_rows: Tensor) -> Tensor:
-        """(blocks + 1, groups) int64 pair at which each group's part of each block begins, and the groups' ends."""
-        sizes = torch.tensor(self.counts, dtype=torch.long, device=first_rows.device)
-        inside = sizes.repeat(len(first_rows) + 1, 1)
-        if len(first_rows) == 1:
-            inside[0] = 0
-        else:
-            for column, group in enumerate(self.outputs.split_with_sizes(self.counts)):
-                inside[:-1, column] = torch.searchsorted(group, first_rows.int())
-        return inside + (sizes.cumsum(0) - sizes)
+    def _run_sizes(self, first_rows: Tensor) -> Tensor:
+        """(groups, blocks) int64 pairs of each group that reach the rows of each block."""
+        ends = torch.tensor(self.counts, dtype=torch.long, device=first_rows.device)[:, None]
+        if len(first_rows) == 1 or not self.counts:
+            return ends
+        groups = self.outputs.split_with_sizes(self.counts)
+        begins = torch.stack([torch.searchsorted(group, first_rows.int()) for group in groups])
+        return torch.cat([begins, ends], 1).diff(dim=1)
 
-    def _block(self, rows: slice, begin: list[int], end: list[int], starts: Tensor) -> Block:
-        bounds = zip(begin, end, self.elements, strict=True)
-        runs, elements = zip(*[(slice(a, b), e) for a, b, e in bounds if b > a] or [(slice(0), 0)], strict=True)
-        inputs, outputs = (tuple(side[run] for run in runs) for side in (self.inputs, self.outputs))
+    def _block(
+        self, rows: slice, inputs: Sequence[Tensor], outputs: Sequence[Tensor], sizes: Sequence[int], starts: Tensor
+    ) -> Block:
+        runs = [run for run in zip(inputs, outputs, self.elements, sizes, strict=True) if run[-1]]
+        runs = runs or [(self.inputs[:0], self.outputs[:0], 0, 0)]
+        inputs, outputs, elements, sizes = zip(*runs, strict=True)
         local = torch.cat(outputs)
         if rows.stop - rows.start < 2**15:  # fewer digits for the radix sort
             local = (local - rows.start).short()
         order, own = torch.sort(local, stable=True)[1].int(), starts[rows.start : rows.stop + 1]
-        sizes = tuple(run.stop - (run.start or 0) for run in runs)
         return Block(rows, inputs, outputs, elements, sizes, order, (own - own[0]).int())
 
 
@@ -225,10 +225,10 @@ def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
     if len(keys) << bits > _TABLE * 64 and (int(number[-1]) + 1) << bits > _TABLE * 64:
         return _search(keys, wanted)
     written = chunk.long()
-    numbers = zeroed("chunks", (cells >> bits) + 1, rows).index_copy_(0, written, number)
+    numbers = zeroed("chunks", (cells >> bits) + 1, rows).scatter_(0, written, number)
     cell = scratch("cells", (int(number[-1]) + 1) << bits, 1, rows).view(-1).fill_(-1)
     inside = (1 << bits) - 1
-    cell.index_copy_(0, (number.long() << bits) + (keys & inside), rows)
+    cell.scatter_(0, (number.long() << bits) + (keys & inside), rows)
     place = numbers.index_select(0, wanted >> bits).bitwise_left_shift_(bits)
     found = cell.index_select(0, place.add_(wanted & inside))
     numbers.index_fill_(0, written, 0)
@@ -292,10 +292,9 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     flat = flat.index_select(0, by_element)
     counts = tuple(torch.bincount(element, minlength=kernel.volume).tolist())
     key, order = torch.sort(key.view(-1).index_select(0, flat), stable=True)
-    unique, pairs = torch.unique_consecutive(key, return_counts=True)
-    outputs = torch.empty(len(order), dtype=torch.int32, device=key.device)
-    rows = torch.arange(len(unique), dtype=torch.int32, device=key.device)
-    outputs.index_copy_(0, order, torch.repeat_interleave(rows, pairs, output_size=len(order)))
+    first = F.pad(key[1:] != key[:-1], (1, 0), value=True)[: len(key)]  # of the pairs of an output
+    row = first.cumsum(0, dtype=torch.int32) - 1
+    unique, outputs = torch.masked_select(key, first), torch.empty_like(row).scatter_(0, order, row)
     inputs = (flat % max(len(b), 1)).int()
     elements = tuple(range(kernel.volume))
     book = Rulebook(inputs, outputs, elements, counts, len(b), len(unique), kernel.volume)
