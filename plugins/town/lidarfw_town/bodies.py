@@ -27,8 +27,11 @@ _CLOTHES = (
 PANE = Surface(10, 0.03, (0.07, 0.09, 0.11))
 TYRE = Surface(10, 0.08, (0.05, 0.05, 0.05))
 PLATE = Surface(10, 1.7, (0.85, 0.85, 0.75))
-HEADLAMP = Surface(10, 0.7, (0.9, 0.9, 0.85))
-TAIL_LAMP = Surface(10, 0.9, (0.6, 0.05, 0.05))
+HEADLAMP = Surface(10, 0.7, (0.9, 0.9, 0.85), 6.0)
+TAIL_LAMP = Surface(10, 0.9, (0.6, 0.05, 0.05), 1.5)
+
+
+_ROUNDING = 0.16  # share of the width that a body loses at its two ends
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,15 @@ class Outline:
     glazed: tuple[bool, ...]  # by gap between two stations
     wheels: tuple[float, ...]  # places of the axles along x, shares
     wheel: float  # radius in metres
+
+    def varied(self, rng: np.random.Generator) -> Outline:
+        """The outline of another make: its roof, belt and bonnet a little elsewhere."""
+        table = np.array(self.stations)
+        table[1:-1, 0] += rng.normal(0, 0.012, len(table) - 2)
+        table[:, 1:] += rng.normal(0, 0.012, 3) + rng.normal(0, 0.008, table[:, 1:].shape)
+        table[:, 0] = np.maximum.accumulate(np.clip(table[:, 0], 0, 1))
+        table[:, 2] = np.maximum(table[:, 2], table[:, 1] + 0.03)
+        return replace(self, stations=tuple(tuple(row) for row in table.tolist()))
 
 
 _SEDAN = Outline(
@@ -128,7 +140,12 @@ def _body(outline: Outline, length: float, width: float, height: float, paint: S
 
 
 def _section(x: float, belt: float, top: float, narrow: float, low: float) -> list[tuple[float, float, float]]:
-    return [(x, -0.96, low), (x, -1, belt), (x, -narrow, top), (x, narrow, top), (x, 1, belt), (x, 0.96, low)]
+    wide = 1 - _ROUNDING * abs(2 * x - 1) ** 6  # seen from above, the corners are round
+    half = np.array([0.95, 1, narrow]) * wide
+    return [
+        (x, -half[0], low), (x, -half[1], belt), (x, -half[2], top),
+        (x, half[2], top), (x, half[1], belt), (x, half[0], low),
+    ]  # fmt: skip
 
 
 def _wheels(axles: Sequence[float], radius: float, length: float, width: float) -> list[Mesh]:
@@ -153,7 +170,9 @@ def _wheels(axles: Sequence[float], radius: float, length: float, width: float) 
 def _paint(rng: np.random.Generator) -> Surface:
     """Paint whose reflectance in the infrared says little about its colour."""
     colour = _PAINTS[int(rng.integers(len(_PAINTS)))]
-    return Surface(10, float(rng.choice([0.05, 0.15, 0.3, 0.45])) * float(rng.uniform(0.8, 1.2)), colour).varied(rng)
+    # about half of the beams on real paint come back too faint for a remission
+    reflectance = float(rng.choice([0.06, 0.09, 0.12, 0.18, 0.28, 0.4])) * float(rng.uniform(0.8, 1.2))
+    return Surface(10, max(reflectance, 0.05), colour).varied(rng, 0.08)
 
 
 def _size(rng: np.random.Generator, mean: Sequence[float], spread: float = 0.06) -> tuple[float, float, float]:
@@ -164,14 +183,14 @@ def _size(rng: np.random.Generator, mean: Sequence[float], spread: float = 0.06)
 def car(rng: np.random.Generator) -> Mesh:
     """A saloon, hatchback, estate or off-roader; sizes as in KITTI's labels."""
     choices = (
-        (_SEDAN, (4.4, 1.68, 1.46)),
-        (_HATCH, (3.75, 1.6, 1.5)),
-        (_ESTATE, (4.3, 1.67, 1.5)),
-        (_SUV, (4.3, 1.75, 1.7)),
+        (_SEDAN, (4.2, 1.66, 1.46)),
+        (_HATCH, (3.6, 1.58, 1.51)),
+        (_ESTATE, (4.15, 1.65, 1.51)),
+        (_SUV, (4.1, 1.72, 1.69)),
     )
-    outline, mean = choices[int(rng.choice(4, p=[0.25, 0.4, 0.2, 0.15]))]
+    outline, mean = choices[int(rng.choice(4, p=[0.25, 0.42, 0.18, 0.15]))]
     size = _size(rng, mean)
-    return _body(outline, *size, _paint(rng)).fitted(*size)
+    return _body(outline.varied(rng), *size, _paint(rng)).fitted(*size)
 
 
 def van(rng: np.random.Generator) -> Mesh:

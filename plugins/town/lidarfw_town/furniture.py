@@ -27,15 +27,18 @@ from lidarfw_town.mesh import (
     quads,
     tube,
 )  # fmt: skip
-from lidarfw_town.streets import arc_length
+from lidarfw_town.streets import arc_length, resampled
 
 _SIGN_COLOURS = ((0.85, 0.2, 0.18), (0.15, 0.3, 0.75), (0.9, 0.85, 0.2), (0.9, 0.9, 0.9))
+
+
+_LANTERN = replace(POLE, colour=(0.95, 0.80, 0.55), glow=5.0)
 
 
 def tree(rng: np.random.Generator) -> Mesh:
     """A tree: trunk, a few boughs, a porous crown."""
     height, crown = float(rng.uniform(4.5, 11)), float(rng.uniform(1.3, 2.8))
-    fork = height * float(rng.uniform(0.3, 0.45))
+    fork = height * float(rng.uniform(0.12, 0.42))
     thick = 0.025 * height * float(rng.uniform(0.7, 1.2))
     green = FOLIAGE.varied(rng, 0.2)
     lean = rng.normal(0, 0.15, 2)
@@ -45,15 +48,39 @@ def tree(rng: np.random.Generator) -> Mesh:
         parts.append(tube((*lean * 0.5, fork), (*(lean + side), height * 0.8), thick * 0.4, TRUNK, 0.4, 4))
     middle = (fork + height) / 2
     count = int(150 * crown * (height - fork) / 4)
-    parts.append(leaves((*lean, middle + 0.3), (crown, crown, (height - fork) / 2), count, 0.27, green, rng))
+    parts.append(leaves((*lean, middle + 0.3), (crown, crown, (height - fork) / 2), count, 0.38, green, rng))
     return join(parts)
 
 
 def bush(rng: np.random.Generator) -> Mesh:
     """A bush without a trunk."""
     radius, height = float(rng.uniform(0.5, 1.3)), float(rng.uniform(0.5, 1.1))
-    count = int(130 * radius)
-    return leaves((0, 0, height * 0.8), (radius, radius, height), count, 0.22, FOLIAGE.varied(rng, 0.2), rng)
+    count = int(210 * radius)
+    return leaves((0, 0, height * 0.8), (radius, radius, height), count, 0.3, FOLIAGE.varied(rng, 0.2), rng)
+
+
+def thicket(line: Array, hills: Hills, lift: float, rng: np.random.Generator) -> Mesh:
+    """Undergrowth along a polyline: bushes of many sizes, some of them grown into each other."""
+    parts = []
+    for place in resampled(line, 1.8) + rng.normal(0, 0.6, (len(resampled(line, 1.8)), 2)):
+        if rng.random() < 0.8:
+            height = float(hills.height(place)) + lift
+            parts.append(_scrub(rng).placed(float(place[0]), float(place[1]), height, float(rng.uniform(0, 6.28))))
+    return join(parts)
+
+
+def _scrub(rng: np.random.Generator) -> Mesh:
+    wide, deep, height = rng.uniform(0.7, 1.6), rng.uniform(0.6, 1.3), rng.uniform(0.6, 1.9)
+    count = int(95 * (wide + deep) * height**0.5)
+    return leaves((0, 0, height * 0.75), (wide, deep, height), count, 0.4, FOLIAGE.varied(rng, 0.2), rng)
+
+
+def shed(rng: np.random.Generator) -> Mesh:
+    """A garden shed, a garage, a container or a stack of goods: boxes of the sizes of vehicles, and others."""
+    length, width, height = rng.uniform(1.0, 6.0), rng.uniform(0.8, 3.0), rng.uniform(0.9, 2.6)
+    surface = replace(STRUCTURE, semantic=50, reflectance=float(rng.uniform(0.1, 0.5))).varied(rng, 0.25)
+    roof = box((0, 0, height), (length + 0.2, width + 0.2, 0.08), surface.varied(rng))
+    return join([box((0, 0, height / 2 - 0.1), (length, width, height + 0.2), surface), roof])
 
 
 def lamp(rng: np.random.Generator) -> Mesh:
@@ -63,7 +90,7 @@ def lamp(rng: np.random.Generator) -> Mesh:
         tube((0, 0, -0.2), (0, 0, height), 0.09, POLE, 0.6),
         tube((0, 0, height), (1.5, 0, height + 0.2), 0.05, POLE),
     ]
-    return join([*parts, box((1.7, 0, height + 0.2), (0.6, 0.25, 0.12), POLE)])
+    return join([*parts, box((1.7, 0, height + 0.2), (0.6, 0.25, 0.12), _LANTERN)])
 
 
 def sign(rng: np.random.Generator) -> Mesh:
@@ -85,7 +112,8 @@ def traffic_light(rng: np.random.Generator) -> Mesh:
         parts.append(box(place, (0.25, 0.3, 0.9), head))
         lights = ((0.9, 0.15, 0.1), (0.9, 0.6, 0.1), (0.1, 0.7, 0.3))
         for step, colour in zip((0.28, 0, -0.28), lights):
-            parts.append(box((place[0] + 0.14, place[1], place[2] + step), (0.03, 0.2, 0.2), Surface(99, 0.3, colour)))
+            pane = Surface(99, 0.3, colour, 3.0 if step > 0 else 0.0)  # the upper lamp is on
+            parts.append(box((place[0] + 0.14, place[1], place[2] + step), (0.03, 0.2, 0.2), pane))
     return join(parts)
 
 
@@ -153,7 +181,7 @@ def hedge(line: Array, hills: Hills, height: float, lift: float, rng: np.random.
         length = float(np.linalg.norm(b - a))
         yaw = float(np.arctan2(b[1] - a[1], b[0] - a[0]))
         cards = leaves(
-            (0, 0, height / 2), (length / 2, 0.32, height / 2), int(34 * length * height), 0.2, green, rng, block=True
+            (0, 0, height / 2), (length / 2, 0.32, height / 2), int(34 * length * height), 0.27, green, rng, block=True
         )
         heart = box((0, 0, height * 0.42), (length, 0.25, height * 0.8), green)
         parts.append(join([cards, heart]).moved(_turned(yaw), (a + b) / 2))

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 
 from lidarfw_town.mesh import Mesh
@@ -64,12 +65,18 @@ _ROADS = (40, 44, 60)
 _ROUGH = (70, 71, 72)  # vegetation, trunks, terrain: matt at every incidence, and not quite where their triangles are
 
 
+@functools.cache
+def _device() -> EmbreeDevice:
+    # one for all scenes: Embree fails where a process has about a thousand
+    return EmbreeDevice()
+
+
 class Scene:
     """Triangles made ready for rays."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
-        self._scene = EmbreeScene()
+        self._scene = EmbreeScene(_device())
         if len(mesh):
             TriangleMesh(self._scene, mesh.triangles)
 

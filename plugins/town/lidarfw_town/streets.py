@@ -14,6 +14,9 @@ LANE = 3.5  # metres
 PARKING_WIDTH = 2.3
 PAVEMENT_WIDTH = 2.4
 TRIM = 11.0  # metres from a node at which its junction begins
+CROSSING = 14.0  # metres from a node at which people cross a street
+# how streets are built up, how often, and how often a side has parking bays
+_SETTINGS = {"terrace": (0.35, 0.8), "suburb": (0.4, 0.55), "open": (0.25, 0.1)}
 CIRCUIT = 620.0  # metres of the way that is driven again and again
 
 
@@ -26,6 +29,7 @@ class Street:
     line: Array
     highway: bool
     parking: tuple[bool, bool]  # parking bays at the right, at the left
+    setting: str = "open"  # terrace: house by house; suburb: houses in gardens; open: fields and trees
 
     @property
     def half_width(self) -> float:
@@ -85,7 +89,10 @@ def _connected(pairs: list[tuple[int, int]], count: int) -> bool:
 
 def _street(nodes: Array, pair: tuple[int, int], rng: np.random.Generator) -> Street:
     line = _bent(nodes[pair[0]], nodes[pair[1]], float(rng.normal(0, 7)))
-    return Street(*pair, line, False, (bool(rng.random() < 0.85), bool(rng.random() < 0.85)))
+    shares = [share for share, _ in _SETTINGS.values()]
+    setting = list(_SETTINGS)[int(rng.choice(len(shares), p=shares))]
+    right, left = rng.random(2) < _SETTINGS[setting][1]
+    return Street(*pair, line, False, (bool(right), bool(left)), setting)
 
 
 def _bent(a: Array, b: Array, bend: float) -> Array:
@@ -182,7 +189,9 @@ def lane_path(network: Network, route: Sequence[int], side: float = 0.0, step: f
         right = (LANE * 1.5 + 1.0 if street.highway else LANE / 2) + side
         lane = offset(trimmed(line, TRIM, TRIM), right)
         if parts:
-            curve = _turn(parts[-1], lane)
+            before, lane = _with_room(parts[-1], lane)
+            limits[-1], parts[-1] = limits[-1][: len(before)], before
+            curve = _turn(before, lane)
             parts.append(curve)
             limits.append(np.full(len(curve), 8.0))
         parts.append(lane)
@@ -191,6 +200,17 @@ def lane_path(network: Network, route: Sequence[int], side: float = 0.0, step: f
     along = arc_length(whole)
     path = resampled(whole, step)
     return path, np.interp(np.arange(len(path)) * step, along, limit)
+
+
+def _with_room(before: Array, after: Array) -> tuple[Array, Array]:
+    """Two lanes with their ends shortened until the way from one to the other leads ahead, as at sharp corners."""
+    for _ in range(6):
+        way = after[0] - before[-1]
+        leave, enter = before[-1] - before[-2], after[1] - after[0]
+        if min(way @ leave / np.linalg.norm(leave), way @ enter / np.linalg.norm(enter)) > 4 or len(before) < 8:
+            break
+        before, after = before[:-1], after[1:]
+    return before, after
 
 
 def _turn(before: Array, after: Array) -> Array:

@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidarfw_town.bodies import KINDS, VEHICLES, make
-from lidarfw_town.ground import KERB_HEIGHT
 from lidarfw_town.mesh import Array, Mesh
 from lidarfw_town.streets import (
+    CROSSING,
     LANE,
     PARKING_WIDTH,
     PAVEMENT_WIDTH,
+    Street,
     arc_length,
     circuit,
     headings,
@@ -29,11 +30,13 @@ from lidarfw_town.streets import (
 from lidarfw_town.world import SLOT, World
 
 PERIOD = 0.1  # seconds from frame to frame
-_ON_ROAD = ("car",) * 20 + ("van",) * 4 + ("truck",) * 4 + ("bus",) * 2 + ("cyclist",) * 14 + ("motorcyclist",) * 2
+_ON_ROAD = ("car",) * 20 + ("van",) * 4 + ("truck",) * 4 + ("bus",) * 2 + ("cyclist",) * 8 + ("motorcyclist",) * 2
 _PARKED = ("car",) * 12 + ("van",) * 2
 _ACCELERATION, _BRAKING, _HEADWAY, _GAP = 1.4, 2.2, 1.3, 2.5  # of the driver model: m/s2, m/s2, seconds, metres
 _SIDEWAYS = 2.2  # m/s2 that a driver takes in curves
 _LOOK = np.arange(2, 46, 2.0)  # metres ahead on the own path at which others are looked for
+_FORESEEN = np.arange(0.5, 3.1, 0.5)  # seconds ahead that drivers look at the ways of others
+_PATIENCE = 5.0  # seconds after which a driver no longer gives way
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +85,10 @@ class Traffic:
         self._world, self._traversal, self._circuit = world, traversal, circuit
         self._rng = np.random.default_rng((world.seed, 1, traversal))
         self.parked = self._park(traversal)
-        vehicles = self._drive(steps)
+        walkers = Walkers(*self._loops())
+        vehicles = self._drive(steps, walkers)
         self.ego = vehicles[0].track
-        people = self._walk(steps, len(vehicles))
-        self.movers = [*vehicles[1:], *people]
+        self.movers = [*vehicles[1:], *self._crossing(walkers), *self._strolling(steps)]
 
     def _park(self, traversal: int) -> list[Parked]:
         """A kept third of the slots depends on the world alone; the rest is drawn for the traversal."""
@@ -104,7 +107,7 @@ class Traffic:
             parked.append(Parked(10000 + int(slot), kind, seed, np.array([*place, yaw])))
         return parked
 
-    def _drive(self, steps: int, count: int = 46) -> list[Mover]:
+    def _drive(self, steps: int, walkers: Walkers, count: int = 24) -> list[Mover]:
         rng, network = self._rng, self._world.network
         kinds = ["car", *(str(_ON_ROAD[int(i)]) for i in rng.integers(len(_ON_ROAD), size=count))]
         paths, limits, lengths, starts = [], [], [], []
@@ -120,7 +123,7 @@ class Traffic:
             limits.append(_speed_plan(path, np.minimum(limit * rng.uniform(0.8, 1.05), _fastest(kind, street.highway))))
             lengths.append(float(np.ptp(make(kind, self._seed(number)).triangles[..., 0])))
             starts.append(0.0 if number == 0 else float(rng.uniform(0, 60)))
-        tracks = _Road(paths, limits, np.array(lengths), np.array(starts)).run(steps)
+        tracks = _Road(paths, limits, np.array(lengths), np.array(starts), walkers).run(steps)
         return [
             Mover(n, kind, self._seed(n), track)
             for n, (kind, track) in enumerate(zip(kinds, tracks))
@@ -130,22 +133,51 @@ class Traffic:
     def _seed(self, number: int) -> tuple[int, ...]:
         return (self._world.seed, 4, number, self._traversal)
 
-    def _walk(self, steps: int, first: int, count: int = 60) -> list[Mover]:
-        """People who walk up and down a pavement, some of them in pairs, some standing."""
-        rng, streets = self._rng, [s for s in self._world.network.streets if not s.highway]
-        movers = []
-        for number in range(count):
-            street, side = streets[int(rng.integers(len(streets)))], int(rng.integers(2))
+    def _loops(self, count: int = 24) -> tuple[list[Array], Array, Array, Array]:
+        """Walks about a street, over both of its crossings: paths, gates, speeds and first places of `Walkers`."""
+        rng, paths, gates = self._rng, [], []
+        for _ in range(count):
+            street = self._built_up()
+            line = trimmed(street.line, CROSSING, CROSSING)
+            right, left = (
+                LANE + PARKING_WIDTH * parking + PAVEMENT_WIDTH * float(rng.uniform(0.4, 0.85))
+                for parking in street.parking
+            )
+            there, back = offset(line, right), offset(line[::-1], left)
+            paths.append(resampled(np.concatenate([there, back, there[:1]]), Walkers.STEP))
+            first, across, second = float(arc_length(there)[-1]), right + left, float(arc_length(back)[-1])
+            kerb = LANE + 0.4
+            starts = np.array([first + right, first + across + second + left]) - kerb
+            gates.append(np.stack([starts, starts + 2 * kerb], 1))
+        speeds = np.clip(rng.normal(1.35, 0.2, count), 0.7, 2)
+        return paths, np.array(gates), speeds, rng.uniform(0, 1, count)
+
+    def _built_up(self) -> Street:
+        """A street with pavements; any, where the town has none."""
+        streets = [s for s in self._world.network.streets if not s.highway]
+        lined = [s for s in streets if s.setting != "open"] or streets
+        return lined[int(self._rng.integers(len(lined)))]
+
+    def _crossing(self, walkers: Walkers) -> list[Mover]:
+        tracks = walkers.tracks()
+        return [Mover(200 + n, "pedestrian", self._seed(200 + n), track) for n, track in enumerate(tracks)]
+
+    def _strolling(self, steps: int, count: int = 24) -> list[Mover]:
+        """People who walk up and down a pavement, some of them standing."""
+        rng, movers = self._rng, []
+        for number in range(300, 300 + count):
+            street, side = self._built_up(), int(rng.integers(2))
             edge = LANE + PARKING_WIDTH * street.parking[side] + PAVEMENT_WIDTH * float(rng.uniform(0.4, 0.85))
             line = resampled(offset(trimmed(street.line[:: 1 - 2 * side], 16, 16), edge), 1.0)
-            speed = 0.0 if rng.random() < 0.2 else float(np.clip(rng.normal(1.35, 0.2), 0.7, 2))
+            speed = 0.0 if rng.random() < 0.3 else float(np.clip(rng.normal(1.35, 0.2), 0.7, 2))
             track = _to_and_fro(line, float(rng.uniform(0, 1)), speed, steps)
-            movers.append(Mover(first + 100 + number, "pedestrian", self._seed(1000 + number), track))
+            movers.append(Mover(number, "pedestrian", self._seed(number), track))
         return movers
 
     def height(self, kind: str, place: Array) -> float:
-        """Metres of the ground under an object."""
-        lift = KERB_HEIGHT if kind == "pedestrian" else 0.0
+        """Metres of the ground under an object at a place (x, y, ...)."""
+        # a wheel on the kerb lifts no vehicle
+        lift = self._world.lift(place[:2], 0.0 if kind == "pedestrian" else 1.5)
         return float(self._world.hills.height(place[:2])) + lift
 
 
@@ -163,16 +195,75 @@ def _speed_plan(path: Array, limit: Array) -> Array:
     return np.asarray(np.maximum(speed, 2.0))
 
 
-class _Road:
-    """Vehicles on their paths. Each follows, or waits for, whatever is on its own path ahead."""
+class Walkers:
+    """People who walk in loops and cross streets at crossings, when no vehicle is too near to stop.
 
-    def __init__(self, paths: list[Array], plans: list[Array], lengths: Array, starts: Array) -> None:
+    `paths`: closed polylines with a point every STEP metres. `gates` (N, 2, 2): where along its path each enters and
+    leaves the carriageway at its two crossings, metres. `speeds` (N,) in m/s. `starts` (N,): first place, share of
+    the loop. Who stands at the kerb waits; vehicles that can stop do.
+    """
+
+    STEP = 0.5
+
+    def __init__(self, paths: list[Array], gates: Array, speeds: Array, starts: Array) -> None:
+        self._paths, self._gates, self._speeds = paths, gates, speeds
+        self._total = np.array([len(path) for path in paths]) * self.STEP
+        self._along = starts * self._total
+        self._states: list[Array] = []
+
+    def crossing(self) -> list[tuple[int, Array, bool]]:
+        """Who is on a carriageway (True) or stands at the kerb: number, the way still to go (P, 2), which."""
+        found = []
+        place = self._along % self._total
+        on = (self._gates[..., 0] < place[:, None]) & (place[:, None] < self._gates[..., 1])
+        soon = self._gates[..., 0] - place[:, None]
+        at_kerb = (soon >= 0) & (soon <= self._speeds[:, None] * PERIOD)
+        for number, gate in np.argwhere(on | at_kerb):
+            way = np.arange(place[number], self._gates[number, gate, 1] + 0.5, 0.5)
+            found.append((int(number), self._at(number, way), bool(on[number, gate])))
+        return found
+
+    def _at(self, number: int, along: Array) -> Array:
+        path = self._paths[number]
+        at = np.arange(len(path) + 1) * self.STEP
+        closed = np.concatenate([path, path[:1]])
+        along = along % self._total[number]
+        return np.stack([np.interp(along, at, closed[:, axis]) for axis in (0, 1)], -1)
+
+    def advance(self, waiting: set[int], *, record: bool) -> None:
+        """Walk on for a period; those who wait stand."""
+        speed = self._speeds.copy()
+        speed[list(waiting)] = 0
+        self._along = self._along + speed * PERIOD
+        if record:
+            self._states.append(np.stack([self._along, speed], 1))
+
+    def tracks(self) -> list[Array]:
+        """Tracks (T, 4) of what was recorded."""
+        states = np.stack(self._states, 1)
+        tracks = []
+        for number, (along, speed) in enumerate(zip(states[..., 0], states[..., 1])):
+            place = self._at(number, along)
+            # a step ahead and a step behind: corners are rounded
+            chord = self._at(number, along + 0.4) - self._at(number, along - 0.4)
+            yaw = np.unwrap(np.arctan2(chord[:, 1], chord[:, 0]))
+            tracks.append(np.concatenate([place, yaw[:, None], speed[:, None]], 1))
+        return tracks
+
+
+class _Road:
+    """Vehicles on their paths. Each follows whatever is on its own path ahead, and gives way.
+
+    To vehicles from the right whose way crosses the own, and to people at crossings, where there is room to brake.
+    """
+
+    def __init__(self, paths: list[Array], plans: list[Array], lengths: Array, starts: Array, walkers: Walkers) -> None:
         longest = max(len(path) for path in paths)
         self.path = np.stack([np.pad(p, ((0, longest - len(p)), (0, 0)), mode="edge") for p in paths])
         self.yaw = np.stack([np.pad(np.unwrap(headings(p)), (0, longest - len(p)), mode="edge") for p in paths])
         self.plan = np.stack([np.pad(p, (0, longest - len(p)), mode="edge") for p in plans])
         self.ends = np.array([len(path) for path in paths]) * 0.5 - 30
-        self.length, self.along = lengths, starts
+        self.length, self.along, self.walkers = lengths, starts, walkers
         self.speed = np.zeros(len(paths))
         self.waited = np.zeros(len(paths))
 
@@ -182,7 +273,7 @@ class _Road:
         self.speed = self._at(self.plan) * 0.8
         states = []
         for step in range(warm_up + steps + 2):
-            self._advance(there)
+            self._advance(there, record=step >= warm_up)
             if step >= warm_up:
                 states.append(np.stack([*self._places().T, self._at(self.yaw), self.speed], 1))
         tracks = np.stack(states, 1)
@@ -194,8 +285,20 @@ class _Road:
         rows = np.arange(len(table))
         return np.asarray(table[rows, first] * (1 - (where - first)) + table[rows, first + 1] * (where - first))
 
+    def _ahead(self, metres: Array) -> tuple[Array, Array]:
+        """Places (V, L, 2) and headings (V, L) on the own paths, `metres` (V, L) or (L,) ahead."""
+        index = np.clip(((self.along[:, None] + metres) / 0.5).astype(int), 0, self.path.shape[1] - 1)
+        rows = np.arange(len(index))[:, None]
+        return self.path[rows, index], self.yaw[rows, index]
+
     def _places(self) -> Array:
         return np.stack([self._at(self.path[..., axis]) for axis in (0, 1)], 1)
+
+    def _bodies(self) -> Array:
+        """Front, middle and rear (V, 3, 2): an outstretched vehicle counts by all of them."""
+        reach, yaw = self.length[:, None] * np.array([-0.4, 0, 0.4]), self._at(self.yaw)
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], 1)
+        return np.asarray(self._places()[:, None] + reach[..., None] * ahead[:, None])
 
     def _room(self) -> np.ndarray:
         """Vehicles are let in one after another where 14 m are free."""
@@ -205,8 +308,10 @@ class _Road:
             there[number] = not (there & (apart < 14)).any()
         return there
 
-    def _advance(self, there: np.ndarray) -> None:
-        gap, theirs = self._ahead(there)
+    def _advance(self, there: np.ndarray, *, record: bool) -> None:
+        gap, theirs = self._vehicle_ahead(there)
+        stop = np.minimum(self._gap_to_crossers(there, record=record), self._gap_to_right(there))
+        theirs, gap = np.where(stop < gap, 0.0, theirs), np.minimum(gap, stop)
         wanted = np.maximum(self._at(self.plan), 0.5)
         closing = self.speed * (self.speed - theirs) / (2 * np.sqrt(_ACCELERATION * _BRAKING))
         room = _GAP + np.maximum(self.speed * _HEADWAY + closing, 0)
@@ -216,31 +321,67 @@ class _Road:
         self.along = self.along + self.speed * PERIOD
         self.waited = np.where(self.speed < 0.3, self.waited + PERIOD, 0)
 
-    def _ahead(self, there: np.ndarray) -> tuple[Array, Array]:
+    def _vehicle_ahead(self, there: np.ndarray) -> tuple[Array, Array]:
         """Gap in metres to the next vehicle on the own path, and its speed along that path."""
-        rows, places, yaw = np.arange(len(self.along)), self._places(), self._at(self.yaw)
-        index = np.clip(((self.along[:, None] + _LOOK) / 0.5).astype(int), 0, self.path.shape[1] - 1)
-        ahead = self.path[rows[:, None], index]
-        # an outstretched vehicle counts by its front, middle and rear
-        reach = self.length[:, None] * np.array([-0.4, 0, 0.4])
-        bodies = places[:, None] + reach[..., None] * np.stack([np.cos(yaw), np.sin(yaw)], 1)[:, None]
-        flat, points = ahead.reshape(-1, 2), bodies.reshape(-1, 2)
-        square = (flat**2).sum(1)[:, None] + (points**2).sum(1) - 2 * flat @ points.T
-        hit = (
-            (square.reshape(*ahead.shape[:2], len(rows), 3).min(-1) < 1.55**2)
-            & there[None, None]
-            & (rows[:, None] != rows)[:, None]
-        )
+        rows, yaw = np.arange(len(self.along)), self._at(self.yaw)
+        places, bodies = self._ahead(_LOOK)[0], self._bodies()
+        others = (there & (rows[:, None] != rows))[:, None]
+        # there is room beside a bicycle
+        reach = np.where(self.length < 2, 1.3, 1.55)[:, None]
         across = np.abs(np.sin(yaw[:, None] - yaw)) > 0.5
-        # who crosses waits for the lower number; who has waited long goes first
+        # of two that stand in each other's way, the lower number squeezes past after a while
         first = (rows[None] > rows[:, None]) & (self.waited[:, None] > 4 + rows[:, None] * 0.2)
-        hit &= ~(across & first)[:, None]
-        blocked = hit.any(2)
-        nearest = np.where(blocked.any(1), blocked.argmax(1), 0)
-        gap = np.where(blocked.any(1), _LOOK[nearest] - self.length / 2, 1e3)
+        past = (across & first)[:, None] & ~_near(places, bodies, 1.0)
+        hit = others & _near(places, bodies, reach) & ~past
+        gap, nearest = self._first(hit.any(2))
         other = hit[rows, nearest].argmax(1)
         theirs = np.maximum(self.speed[other] * np.cos(yaw[other] - yaw), 0)
-        return gap, np.where(blocked.any(1), theirs, self.speed)
+        return gap, np.where(gap < 1e3, theirs, self.speed)
+
+    def _first(self, blocked: np.ndarray) -> tuple[Array, np.ndarray]:
+        """Gap (V,) to the first blocked place (V, L) ahead, 1e3 for none, and which place it is."""
+        nearest = np.where(blocked.any(1), blocked.argmax(1), 0)
+        return np.where(blocked.any(1), _LOOK[nearest] - self.length / 2, 1e3), nearest
+
+    def _can_stop(self, gap: Array) -> np.ndarray:
+        """Whether a vehicle stops within a gap (V,) without haste."""
+        return np.asarray(gap > self.speed**2 / (2 * _BRAKING) + self.speed * 0.5 + 1)
+
+    def _gap_to_right(self, there: np.ndarray) -> Array:
+        """Gap (V,) to where the way of a vehicle from the right crosses the own; 1e3 for none, or too late to stop."""
+        places, yaw = self._ahead(_LOOK)
+        theirs, headed = self._ahead(self.speed[:, None] * _FORESEEN)
+        near = _near(places, theirs, 2.0, each=True)
+        # it comes from the right if it goes to the left there
+        from_right = np.sin(headed[None, None] - yaw[:, :, None, None]) > 0.5
+        goes = there & (self.speed > 0.5) & ~np.eye(len(there), dtype=bool)
+        crossed = np.asarray(((near & from_right).any(3) & goes[:, None]).any(2))
+        gap, _ = self._first(crossed)
+        return np.where(self._can_stop(gap) & (self.waited < _PATIENCE), gap, 1e3)
+
+    def _gap_to_crossers(self, there: np.ndarray, *, record: bool) -> Array:
+        """Gap (V,) to the nearest crossing that people are on, or wait at; they walk on, or wait, as well."""
+        gap, waiting = np.full(len(there), 1e3), set()
+        places, bodies = self._ahead(_LOOK)[0], self._bodies()
+        for number, way, on_road in self.walkers.crossing():
+            found, _ = self._first(_near(places, way[None], 1.6)[..., 0])
+            able = self._can_stop(found)
+            blocked = _near(bodies, way[None], 2.2).any((1, 2)) & there
+            if not on_road and (blocked | (there & ~able & (self.speed > 0.5))).any():
+                waiting.add(number)
+            gap = np.where(able | on_road, np.minimum(gap, found), gap)
+        self.walkers.advance(waiting, record=record)
+        return gap
+
+
+def _near(places: Array, others: Array, reach: float | Array, *, each: bool = False) -> np.ndarray:
+    """Which places (V, L, 2) are within `reach` metres, one or (W, 1), of any point of others (W, P, 2): (V, L, W).
+
+    With `each`, (V, L, W, P): of which point.
+    """
+    apart = places[:, :, None, None] - others
+    close = (apart**2).sum(-1) < reach**2
+    return np.asarray(close if each else close.any(-1))
 
 
 def _to_and_fro(line: Array, start: float, speed: float, steps: int) -> Array:

@@ -27,6 +27,7 @@ from lidarfw_town.mesh import (
     join,
 )  # fmt: skip
 from lidarfw_town.streets import (
+    CROSSING,
     LANE,
     PARKING_WIDTH,
     PAVEMENT_WIDTH,
@@ -42,6 +43,8 @@ from lidarfw_town.streets import (
 
 MARGIN = 70.0  # metres of land around the outermost streets
 SLOT = 5.6  # metres of a parking slot along the street
+_SETBACKS = {"terrace": (0.3, 0.3, 3.0, 6.0), "suburb": (4.0, 7.0, 10.0, 14.0)}  # metres from pavement to house
+_GAPS = {"terrace": (0.0, 0.0, 2.5, 5.0), "suburb": (3.5, 5.0, 9.0, 16.0)}  # metres from house to house
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,13 +66,16 @@ class World:
         self._rng = np.random.default_rng((seed, 0))
         self.hills = Hills(self._rng)
         self.network = build_network(self._rng)
+        self.houses: list[BaseGeometry] = []  # and the places beside them where vehicles stand
+        self._driveways: list[tuple[Array, float]] = []
+        plots = self._plots()
         self.slots = self._parking_slots()
-        self.houses: list[BaseGeometry] = []
         parts = [
             *self._ground(),
             *self._markings(),
-            *self._plots(),
+            *plots,
             *self._roadside(),
+            *self._fields(),
             *self._highway(),
             *self._trees(),
         ]
@@ -90,14 +96,16 @@ class World:
 
     @cached_property
     def paved(self) -> BaseGeometry:
-        """Carriageways and parking bays."""
-        return self.road.union(self.bays).buffer(0.01)
+        """Carriageways and parking bays; prepared for many questions."""
+        whole = self.road.union(self.bays).buffer(0.01)
+        shapely.prepare(whole)
+        return whole
 
     @cached_property
     def pavement(self) -> BaseGeometry:
-        """Pavements along the streets of the town, not along the highway."""
+        """Pavements along the built-up streets."""
         town = shapely.unary_union(
-            [shapely.LineString(s.line).buffer(14.0) for s in self.network.streets if not s.highway]
+            [shapely.LineString(s.line).buffer(14.0) for s in self.network.streets if s.setting != "open"]
         )
         return self.paved.buffer(PAVEMENT_WIDTH).difference(self.paved).intersection(town)
 
@@ -107,19 +115,36 @@ class World:
         low, high = self.network.nodes.min(0) - MARGIN, self.network.nodes.max(0) + MARGIN
         return shapely.box(*low, *high)
 
+    @cached_property
+    def aprons(self) -> BaseGeometry:
+        """Driveways from the street to the slots beside the houses."""
+        areas = [_rectangle(place, 5.4, 2.8, yaw) for place, yaw in self._driveways]
+        return shapely.unary_union(areas).difference(self.paved.union(self.pavement))
+
+    def lift(self, place: Array, within: float = 0.0) -> float:
+        """Metres by which the ground at (x, y) stands above the carriageway: 0 on it and `within` metres of it."""
+        on_it = shapely.dwithin(self.paved, shapely.Point(place), within)
+        return 0.0 if on_it else KERB_HEIGHT
+
     def on_ground(self, mesh: Mesh, place: Array, yaw: float, lift: float = KERB_HEIGHT) -> Mesh:
         """A mesh set on the ground at (x, y)."""
         return mesh.placed(float(place[0]), float(place[1]), float(self.hills.height(place)) + lift, yaw)
 
     def _ground(self) -> list[Mesh]:
         carriageway = self.paved.difference(self.bays)
-        grass = self.land.difference(self.paved.union(self.pavement))
-        areas = ((carriageway, ROAD, 0.0), (self.bays, PARKING, 0.0), (self.pavement, PAVEMENT, KERB_HEIGHT))
-        parts = [pave(area, self.hills, surface, self._rng, lift) for area, surface, lift in areas]
-        return [*parts, pave(grass, self.hills, TERRAIN, self._rng, KERB_HEIGHT), kerbs(self.paved, self.hills, KERB)]
+        grass = self.land.difference(shapely.unary_union([self.paved, self.pavement, self.aprons]))
+        areas = (
+            (carriageway, ROAD, 0.0),
+            (self.bays, PARKING, 0.0),
+            (self.pavement, PAVEMENT, KERB_HEIGHT),
+            (self.aprons, PARKING, KERB_HEIGHT),
+            (grass, TERRAIN, KERB_HEIGHT),
+        )
+        parts = [pave(area, self.hills, kind.varied(self._rng, 0.08), self._rng, lift) for area, kind, lift in areas]
+        return [*parts, kerbs(self.paved, self.hills, KERB)]
 
     def _markings(self) -> list[Mesh]:
-        """Dashed middle lines, lines along the lanes of the highway, and stop lines."""
+        """Dashed middle lines, lines along the lanes of the highway, stop lines and crossings."""
         areas = []
         for street in self.network.streets:
             line = trimmed(street.line, TRIM, TRIM)
@@ -130,7 +155,8 @@ class World:
                     d.buffer(0.075, cap_style="flat") for d in _dashes(offset(line, right), 1.0 if solid else 0.4)
                 ]
             if not street.highway:
-                areas += [_stop_line(line), _stop_line(line[::-1])]
+                for way in (street.line, street.line[::-1]):
+                    areas += [_stop_line(trimmed(way, 0, CROSSING + 2.5)), *_zebra(trimmed(way, 0, CROSSING))]
         return [pave(shapely.unary_union(areas), self.hills, MARKING, self._rng, 0.006)]
 
     def _parking_slots(self) -> Slots:
@@ -138,9 +164,11 @@ class World:
         for street in self.network.streets:
             for side, line in ((0, street.line), (1, street.line[::-1])):
                 if street.parking[side]:
-                    lane = resampled(offset(trimmed(line, TRIM + 6, TRIM + 6), LANE + PARKING_WIDTH / 2), SLOT)
+                    lane = resampled(offset(trimmed(line, TRIM + 9, TRIM + 9), LANE + PARKING_WIDTH / 2), SLOT)
                     centers.append(lane[1:-1])
                     yaws.append(headings(lane)[1:-1])
+        centers += [place[None] for place, _ in self._driveways]
+        yaws += [np.array([yaw]) for _, yaw in self._driveways]
         return Slots(np.concatenate(centers), np.concatenate(yaws))
 
     def _plots(self) -> list[Mesh]:
@@ -148,27 +176,40 @@ class World:
         parts = []
         for street in self.network.streets:
             for side, line in ((0, street.line), (1, street.line[::-1])):
-                if street.highway:
+                if street.setting == "open":
                     continue
                 edge = LANE + PARKING_WIDTH * street.parking[side] + PAVEMENT_WIDTH
-                parts += self._row_of_plots(line, edge) + self._row_of_plots(line, edge + 27.0)
+                parts += self._row_of_plots(line, edge, street.setting)
+                parts += self._row_of_plots(line, edge + 30.0, street.setting)
         return parts
 
-    def _row_of_plots(self, line: Array, edge: float) -> list[Mesh]:
-        parts = []
-        at, end = 13.0, float(arc_length(line)[-1]) - 13.0
+    def _row_of_plots(self, line: Array, edge: float, setting: str) -> list[Mesh]:
+        parts, rng = [], self._rng
+        at, end = 17.0, float(arc_length(line)[-1]) - 17.0
         while at < end:
-            width = float(self._rng.uniform(8, 19))
-            parts += self._plot(line, at, width, edge)
-            at += width + float(self._rng.choice([0.0, 2.5, 4.0, 9.0], p=[0.25, 0.3, 0.3, 0.15]))
+            width = float(rng.uniform(8, 19))
+            parts += self._plot(line, at, width, edge, float(rng.choice(_SETBACKS[setting])))
+            gap = float(rng.choice(_GAPS[setting]))
+            if 3.0 < gap < 6.0 and edge < 10 and rng.random() < 0.7:
+                self._driveway(line, at + width + gap / 2, edge)
+            at += width + gap
         return parts
 
-    def _plot(self, line: Array, at: float, width: float, edge: float) -> list[Mesh]:
+    def _driveway(self, line: Array, at: float, edge: float) -> None:
+        """Room for a vehicle between two houses, its nose or tail towards the street."""
+        place, yaw = _line(line, at, at + 3.0)[0], float(headings(_line(line, at, at + 3.0))[0])
+        right = np.array([np.sin(yaw), -np.cos(yaw)])
+        center, turned = place + right * (edge + float(self._rng.uniform(3.0, 5.5))), yaw + np.pi / 2
+        room = _rectangle(center, 5.4, 2.4, turned)
+        if self._free(room):
+            self._driveways.append((center, turned))
+            self.houses.append(room)
+
+    def _plot(self, line: Array, at: float, width: float, edge: float, setback: float) -> list[Mesh]:
         rng = self._rng
         whole, along = _line(line, at, at + width), float(rng.uniform(8, 13))
         if len(whole) < 2:
             return []
-        setback = float(rng.choice([0.3, 3.0, 6.0, 9.0], p=[0.2, 0.25, 0.3, 0.25]))
         middle, yaw = whole[len(whole) // 2], float(headings(whole)[len(whole) // 2])
         right = np.array([np.sin(yaw), -np.cos(yaw)])
         place = middle + right * (edge + setback + along / 2)
@@ -190,10 +231,10 @@ class World:
         line = resampled(line, 3.0)
         if len(line) < 2 or rng.random() > chance or self._near_road(line):
             return []
-        kind = int(rng.integers(4))
-        if kind <= 1:
+        kind = rng.random()
+        if kind < 0.5:
             return [furniture.hedge(line, self.hills, height, KERB_HEIGHT, rng)]
-        if kind == 2:
+        if kind < 0.88:
             return [furniture.picket_fence(line, self.hills, height, FENCE.varied(rng, 0.3), KERB_HEIGHT)]
         return [furniture.wall(line, self.hills, height * 0.7, 0.25, STRUCTURE.varied(rng), KERB_HEIGHT)]
 
@@ -208,9 +249,39 @@ class World:
                 continue
             for side, line in ((0, street.line), (1, street.line[::-1])):
                 edge = LANE + PARKING_WIDTH * street.parking[side]
-                parts += self._row(trimmed(line, 14, 14), edge + 0.45, side)
+                if street.setting != "open":
+                    parts += self._row(trimmed(line, 17, 17), edge + 0.45, side)
                 parts += self._junction(trimmed(line, TRIM, TRIM), LANE + 0.7)
         return parts
+
+    def _fields(self) -> list[Mesh]:
+        """Along open streets and the highway: trees in rows, undergrowth, fences, and long views between them."""
+        parts, rng = [], self._rng
+        for street in self.network.streets:
+            for line in (street.line, street.line[::-1]):
+                if street.setting != "open":
+                    continue
+                lane = trimmed(line, 20, 20)
+                for begin in np.arange(0, float(arc_length(lane)[-1]) - 25, 25):
+                    for low, high in ((3.5, 9), (10, 18), (20, 34)):
+                        reach = street.half_width + float(rng.uniform(low, high))
+                        parts += self._hem(offset(_line(lane, begin, begin + 25), reach), float(rng.random()))
+        return parts
+
+    def _hem(self, line: Array, draw: float) -> list[Mesh]:
+        rng = self._rng
+        if self._near_road(line) or not self._free(shapely.LineString(line).buffer(1.5)):
+            return []
+        if draw < 0.5:
+            return [furniture.thicket(line, self.hills, KERB_HEIGHT, rng)]
+        if draw < 0.65:
+            return [
+                furniture.picket_fence(line, self.hills, float(rng.uniform(0.9, 1.4)), FENCE.varied(rng), KERB_HEIGHT)
+            ]
+        if draw < 0.8:
+            places = resampled(line, 7.0)
+            return [self.on_ground(furniture.tree(rng), place, float(rng.uniform(0, 6.28))) for place in places]
+        return []
 
     def _row(self, line: Array, right: float, side: int) -> list[Mesh]:
         rng, parts = self._rng, []
@@ -262,14 +333,20 @@ class World:
         """Trees, bushes and stones in gardens, denser at the rim of the town."""
         rng = self._rng
         low, high = np.array(self.land.bounds[:2]), np.array(self.land.bounds[2:])
-        taken = shapely.unary_union([self.paved.buffer(PAVEMENT_WIDTH + 1.6), *(h.buffer(1.5) for h in self.houses)])
+        built = [*(house.buffer(1.5) for house in self.houses), self.aprons.buffer(1.5)]
+        taken = shapely.unary_union([self.paved.buffer(PAVEMENT_WIDTH + 1.6), *built])
         shapely.prepare(taken)
         parts = []
-        for place in rng.uniform(low, high, (int((high - low).prod() / 75), 2)):
+        for place in rng.uniform(low, high, (int((high - low).prod() / 45), 2)):
             if shapely.contains_xy(taken, *place):
                 continue
             kind = rng.random()
-            what = furniture.tree if kind < 0.6 else furniture.bush if kind < 0.95 else furniture.boulder
+            what = (
+                furniture.tree if kind < 0.36
+                else furniture.bush if kind < 0.93
+                else furniture.shed if kind < 0.97
+                else furniture.boulder
+            )  # fmt: skip
             parts.append(self.on_ground(what(rng), place, float(rng.uniform(0, 6.28))))
         return parts
 
@@ -295,6 +372,13 @@ def _dashes(line: Array, share: float) -> list[BaseGeometry]:
     whole, total = shapely.LineString(line), float(arc_length(line)[-1])
     starts = np.arange(0, total - 3, 7.5)
     return [shapely.ops.substring(whole, s, s + 7.5 * share) for s in starts]
+
+
+def _zebra(line: Array) -> list[BaseGeometry]:
+    """The bars of a crossing at the end of a polyline."""
+    place, yaw = line[-1], float(headings(line)[-1])
+    right = np.array([np.sin(yaw), -np.cos(yaw)])
+    return [_rectangle(place + right * aside, 2.6, 0.5, yaw) for aside in np.arange(-LANE + 0.5, LANE, 1.0)]
 
 
 def _stop_line(line: Array) -> BaseGeometry:
