@@ -132,11 +132,13 @@ def _ratio(common: Tensor, size_a: Tensor, size_b: Tensor) -> Tensor:
     return common / (size_a + size_b - common).clamp(min=torch.finfo(common.dtype).tiny ** 0.5)
 
 
-def _bev(a: Tensor, b: Tensor) -> Tensor:
+def plane_ratio(a: Tensor, b: Tensor) -> Tensor:
+    """(P,) IoU in the ground plane of boxes a and b, (7, P) both."""
     return _ratio(_overlap_area(a, b), a[3] * a[4], b[3] * b[4])
 
 
-def _volume(a: Tensor, b: Tensor) -> Tensor:
+def volume_ratio(a: Tensor, b: Tensor) -> Tensor:
+    """(P,) volumetric IoU of boxes a and b, (7, P) both."""
     common = _overlap_area(a, b) * _overlap_height(a, b)
     return _ratio(common, a[3] * a[4] * a[5], b[3] * b[4] * b[5])
 
@@ -189,7 +191,7 @@ def close_pairs(a: Tensor, b: Tensor) -> Tensor:
     return close
 
 
-def overlap_at(a: Tensor, b: Tensor, pairs: Tensor, measure: Callable[[Tensor, Tensor], Tensor] = _bev) -> Tensor:
+def overlap_at(a: Tensor, b: Tensor, pairs: Tensor, measure: Callable[[Tensor, Tensor], Tensor] = plane_ratio) -> Tensor:
     """`measure` (P,) of the boxes a[pairs[:, 0]] and b[pairs[:, 1]], in chunks."""
     chunks = pairs.split(_PAIRS)  # type: ignore[no-untyped-call]
     values = [measure(a[p[:, 0]].t().contiguous(), b[p[:, 1]].t().contiguous()) for p in chunks]
@@ -209,12 +211,12 @@ def _matrix(a: Tensor, b: Tensor, measure: Callable[[Tensor, Tensor], Tensor]) -
 
 def iou_bev(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) intersection over union in the ground plane of boxes a (N, 7) and b (M, 7)."""
-    return _matrix(a, b, _bev)
+    return _matrix(a, b, plane_ratio)
 
 
 def iou_3d(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) volumetric intersection over union of boxes a (N, 7) and b (M, 7)."""
-    return _matrix(a, b, _volume)
+    return _matrix(a, b, volume_ratio)
 
 
 def giou_3d(a: Tensor, b: Tensor) -> Tensor:
@@ -237,12 +239,12 @@ def _paired(a: Tensor, b: Tensor, measure: Callable[[Tensor, Tensor], Tensor]) -
 
 def paired_iou_bev(a: Tensor, b: Tensor) -> Tensor:
     """(N,) BEV IoU of box i of a (N, 7) with box i of b (N, 7); differentiable."""
-    return _paired(a, b, _bev)
+    return _paired(a, b, plane_ratio)
 
 
 def paired_iou_3d(a: Tensor, b: Tensor) -> Tensor:
     """(N,) 3D IoU of box i of a (N, 7) with box i of b (N, 7); differentiable."""
-    return _paired(a, b, _volume)
+    return _paired(a, b, volume_ratio)
 
 
 def paired_giou_3d(a: Tensor, b: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lidarfw.ops.boxes import close_pairs, overlap_at
+from lidarfw.ops.boxes import close_pairs, overlap_at, plane_ratio, volume_ratio
 
 _BLOCK = 256
 
@@ -40,16 +40,20 @@ def _settle(edges: Tensor) -> Tensor:
         stays = now
 
 
-def nms_rotated(boxes: Tensor, scores: Tensor, iou_threshold: float, groups: Tensor | None = None) -> Tensor:
+def nms_rotated(
+    boxes: Tensor, scores: Tensor, iou_threshold: float, groups: Tensor | None = None, *, volume: bool = False
+) -> Tensor:
     """Rows of the boxes kept, int64, by descending score.
 
     Args:
         boxes: (N, 7) x, y, z, l, w, h, yaw.
         scores: (N,).
-        iou_threshold: a box is dropped where its BEV IoU with a kept box of higher score is above it.
+        iou_threshold: a box is dropped where its IoU with a kept box of higher score is above it.
+        volume: take the 3D IoU in place of that in the ground plane.
         groups: (N,) int64; boxes of different groups (samples, classes) never suppress each other.
     """
     boxes = boxes.detach() if boxes.dtype == torch.float64 else boxes.detach().float()
+    measure = volume_ratio if volume else plane_ratio
 
     def suppresses(high: Tensor, low: Tensor) -> Tensor:
         a, b = boxes[high], boxes[low]
@@ -59,7 +63,7 @@ def nms_rotated(boxes: Tensor, scores: Tensor, iou_threshold: float, groups: Ten
         if high is low:
             close = close.triu(1)
         pairs = close.nonzero()
-        close[pairs[:, 0], pairs[:, 1]] = overlap_at(a, b, pairs) > iou_threshold
+        close[pairs[:, 0], pairs[:, 1]] = overlap_at(a, b, pairs, measure) > iou_threshold
         return close
 
     return _greedy(scores, suppresses)

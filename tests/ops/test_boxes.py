@@ -211,3 +211,10 @@ def test_a_long_chain_of_suppression() -> None:
     boxes[:, 0], boxes[:, 3:6] = torch.arange(300) * 0.5, 1.0  # each overlaps its neighbour only, IoU 1/3
     kept = nms_rotated(boxes, torch.arange(300, 0, -1).float(), 0.2)
     assert kept.tolist() == list(range(0, 300, 2))
+
+
+def test_suppression_by_volume_keeps_boxes_above_each_other() -> None:
+    boxes = torch.tensor([[0.0, 0, 0, 4, 2, 2, 0.3], [0.0, 0, 1.5, 4, 2, 2, 0.3]])
+    scores = torch.tensor([0.9, 0.8])
+    assert nms_rotated(boxes, scores, 0.5).tolist() == [0]
+    assert nms_rotated(boxes, scores, 0.5, volume=True).tolist() == [0, 1]

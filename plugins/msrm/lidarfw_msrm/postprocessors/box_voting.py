@@ -1,0 +1,116 @@
+"""Box voting: the boxes that several stages or models give for one object become one.
+
+Source: the MSRM paper, section II-D, equation 8.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from lidarfw.errors import ConfigError
+from lidarfw.interfaces import PostProcessor
+from lidarfw.ops import iou_3d, nms_rotated, scatter_sum
+from lidarfw.types import Boxes, Spec
+from torch import Tensor
+
+MODES, WEIGHTS = ("stage", "cluster"), ("confidence", "uniform")
+
+
+class BoxVoting(PostProcessor):
+    """The mean of boxes weighted by their confidence (MSRM, equation 8).
+
+    mode stage: the boxes of the stages of a cascade, region by region (every stage gives its regions in the same
+    order, `stage` says which is which); `last` takes only so many last stages, 0 all. Mode cluster: the best box and
+    all of its class that overlap it by a 3D IoU over `iou_threshold`, then the best of the rest; works after any
+    detector or ensemble. The score is the mean of the scores. weights uniform: the plain mean.
+
+    Yaw is averaged on the circle after every box is turned to the side of the most confident one: boxes that
+    stand for the same object may point in opposite ways. Other fields are those of the most confident box.
+    """
+
+    def __init__(
+        self,
+        boxes: Spec,
+        *,
+        mode: str = "stage",
+        weights: str = "confidence",
+        last: int = 0,
+        iou_threshold: float = 0.5,
+    ) -> None:
+        super().__init__()
+        for name, value, known in (("mode", mode, MODES), ("weights", weights, WEIGHTS)):
+            if value not in known:
+                raise ConfigError(f"postprocessor 'box_voting': {name} is one of {', '.join(known)}, not {value!r}")
+        self.mode, self.weights, self.last, self.iou_threshold = mode, weights, last, iou_threshold
+        self.provides = boxes
+
+    def forward(self, boxes: Boxes) -> Boxes:
+        """One box for each region or cluster."""
+        if self.mode == "cluster":
+            return self._vote(boxes, self._clusters(boxes))
+        if boxes.stage is None or len(boxes) == 0:
+            return boxes  # of one stage
+        if self.last:
+            boxes = boxes[boxes.stage > boxes.stage.max() - self.last]
+        return self._vote(boxes, _regions(boxes))
+
+    def _clusters(self, boxes: Boxes) -> Tensor:
+        """Cluster (N,) of each box, counted from 0."""
+        group = boxes.label * boxes.batch_size + boxes.batch
+        seeds = nms_rotated(boxes.tensor, boxes.score, self.iou_threshold, group, volume=True)
+        if len(seeds) == 0:
+            return group
+        overlap = iou_3d(boxes.tensor[seeds], boxes.tensor) * (group[seeds, None] == group)
+        overlap[:, seeds] = torch.eye(len(seeds), device=seeds.device, dtype=overlap.dtype)
+        # seeds come by falling score: the first that overlaps a box enough took it
+        near = overlap > self.iou_threshold
+        return torch.where(near.any(0), near.float().argmax(0), overlap.argmax(0))
+
+    def _vote(self, boxes: Boxes, voter: Tensor) -> Boxes:
+        """Equation 8 over the boxes of each voter number (N,)."""
+        count = int(voter.max()) + 1 if len(voter) else 0
+        weight = boxes.score if self.weights == "confidence" else torch.ones_like(boxes.score)
+        total = scatter_sum(weight[:, None], voter, count)
+        weight = torch.where(total[voter, 0] < 1e-9, 1.0, weight)[:, None]  # no confidence at all: the plain mean
+        share = weight / scatter_sum(weight, voter, count)[voter]
+        best = _first_best(boxes.score, voter, count)
+        yaw = boxes.yaw + math.pi * _opposite(boxes.yaw - boxes.yaw[best][voter])
+        values = torch.cat([boxes.center, boxes.size, yaw.cos()[:, None], yaw.sin()[:, None]], 1)
+        mean = scatter_sum(values * share, voter, count)
+        number = voter.bincount(minlength=count).clamp(min=1)
+        score = scatter_sum(boxes.score[:, None], voter, count)[:, 0] / number
+        merged = boxes[best].replace(center=mean[:, :3], size=mean[:, 3:6], score=score, stage=None)
+        return merged.replace(yaw=torch.atan2(mean[:, 7], mean[:, 6]))
+
+
+def _opposite(difference: Tensor) -> Tensor:
+    """1 where angles differ by more than a quarter turn, else 0."""
+    return (difference.cos() < 0).to(difference.dtype)
+
+
+def _first_best(score: Tensor, voter: Tensor, count: int) -> Tensor:
+    """Row (count,) of the highest score of each voter; of equal ones the first."""
+    order = score.argsort(descending=True, stable=True)
+    order = order[voter[order].argsort(stable=True)]
+    starts = voter.bincount(minlength=count).cumsum(0) - voter.bincount(minlength=count)
+    return order[starts[:count]] if len(order) else order
+
+
+def _regions(boxes: Boxes) -> Tensor:
+    """Region (N,) of each box: its place among the boxes of its sample and stage."""
+    stages, stage = torch.unique(boxes.stage, return_inverse=True)
+    group = boxes.batch * len(stages) + stage
+    sizes = group.bincount(minlength=boxes.batch_size * len(stages)).view(-1, len(stages))
+    if bool((sizes != sizes[:, :1]).any()):
+        raise ConfigError(
+            "postprocessor 'box_voting' needs as many boxes of every stage\n"
+            f"  found, by sample and stage: {sizes.tolist()}\n"
+            "  fix: put it before whatever drops boxes: postprocessor=[box_voting,nms], or mode: cluster"
+        )
+    order = group.argsort(stable=True)
+    starts = sizes.flatten().cumsum(0) - sizes.flatten()
+    rank = torch.empty_like(group)
+    rank[order] = torch.arange(len(group), device=group.device) - starts[group[order]]
+    before: Tensor = sizes[:, 0].cumsum(0) - sizes[:, 0]
+    return rank + before[boxes.batch]
