@@ -6,7 +6,7 @@ Colours are those of Okabe and Ito, "Color Universal Design" (2008), told apart 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -95,6 +95,27 @@ def birds_eye(
         _write_labels(axes, boxes, _captions(found))
     shown = boxes if boxes is not None else labels
     _legend(axes, None if shown is None else shown.label, truth, classes)
+    axes.set_title(title, loc="left", fontsize=12)
+    return _render(figure)
+
+
+def plan_view(
+    paths: Mapping[int, npt.NDArray[np.float64]], own: npt.NDArray[np.float64], colours: Mapping[int, str], title: str
+) -> Picture:
+    """Ways in the map from above: numbered lines (N, 2) in metres, and the way of the sensor (N, 2) in black."""
+    places = np.concatenate([own, *paths.values()])
+    low, high = places.min(0) - 5, places.max(0) + 5
+    tall, wide = (high - low).tolist()
+    scale = min(12 / wide, 10 / tall)
+    figure = _figure(max(wide * scale, 4) + 1, max(tall * scale, 3) + 1, layout="constrained")
+    axes = figure.add_subplot()
+    for number, path in paths.items():
+        axes.plot(path[:, 1], path[:, 0], color=colours[number], linewidth=1.2)
+        if len(path) >= 10:
+            axes.annotate(f"#{number}", path[-1, ::-1], fontsize=7, color=colours[number])
+    axes.plot(own[:, 1], own[:, 0], color="#000000", linewidth=1.6)
+    axes.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", xlabel="y (m)", ylabel="x (m)")
+    axes.grid(True, color="#DDDDDD", linewidth=0.6)
     axes.set_title(title, loc="left", fontsize=12)
     return _render(figure)
 
