@@ -28,7 +28,7 @@ from lidarfw.types import Boxes, Camera, FrameMeta, Poses, Tracks
 if TYPE_CHECKING:
     import torch
 
-    from lidarfw.model import PerceptionModel
+    from lidarfw.interfaces import Tracker
 else:
     torch = LazyModule("torch")
 
@@ -150,9 +150,12 @@ def _kitti_poses(path: Path) -> Array:
 def _kitti_cameras(path: Path, rectangles: Array) -> dict[str, Camera]:
     """The cameras of a sequence. The size of its pictures is that of KITTI's largest, or what the 2D boxes reach."""
     size = np.maximum(rectangles[:, 2:].max(0, initial=0), (1241, 374)).astype(int) + 1
-    calibration = kitti.read_calibration(path)
-    upright = replace(calibration, r0_rect=np.eye(3), velo_to_cam=_FROM_CAMERA.T[:3])
-    return upright.cameras(int(size[0]), int(size[1]))
+    return upright(kitti.read_calibration(path)).cameras(int(size[0]), int(size[1]))
+
+
+def upright(calibration: kitti.Calibration) -> kitti.Calibration:
+    """The calibration of a sensor that is the rectified camera with its axes renamed."""
+    return replace(calibration, r0_rect=np.eye(3), velo_to_cam=_FROM_CAMERA.T[:3])
 
 
 def write_kitti(path: Path, frames: Sequence[tuple[FrameMeta, Tracks]], classes: Sequence[str]) -> None:
@@ -311,8 +314,8 @@ def _nuscenes_rows(frame: Detections, tracks: Tracks, prefix: str) -> list[dict[
 # Tracking
 
 
-def make_tracker(overrides: Sequence[str], classes: Sequence[str], poses: bool) -> PerceptionModel:
-    """A model that is nothing but a tracker on given boxes; `overrides` choose and set it (`tracker=ab3dmot`)."""
+def make_tracker(overrides: Sequence[str], classes: Sequence[str]) -> Tracker:
+    """A tracker of boxes and, where there are any, poses; `overrides` choose and set it (`tracker=ab3dmot`)."""
     from lidarfw.assembly import build, plan
     from lidarfw.config import compose, to_plain
     from lidarfw.errors import ConfigError
@@ -321,20 +324,20 @@ def make_tracker(overrides: Sequence[str], classes: Sequence[str], poses: bool) 
     nodes = to_plain(compose(list(overrides))).get("tracker") or {}
     if len(nodes) != 1:
         raise ConfigError(f"one tracker is needed, found {', '.join(nodes) or 'none'}.\n  fix: tracker=NAME")
-    inputs = {"boxes": Spec(Boxes, classes=tuple(classes))} | ({"pose": Spec(Poses)} if poses else {})
-    return build(plan({"tracker": nodes}, DataSpec(inputs, frozenset(), tuple(classes)))).eval()
+    inputs = {"boxes": Spec(Boxes, classes=tuple(classes)), "pose": Spec(Poses)}
+    planned = plan({"tracker": nodes}, DataSpec(inputs, frozenset(), tuple(classes)))
+    tracker: Tracker = build(planned).component(planned.of("tracker")[0]).eval()
+    return tracker
 
 
-def track(model: PerceptionModel, sequence: DetectedSequence) -> Iterator[tuple[Detections, Tracks]]:
+def run(tracker: Tracker, sequence: DetectedSequence) -> Iterator[tuple[Detections, Tracks]]:
     """The frames of a sequence with their tracks, in order."""
-    from lidarfw.types import FrameResult, Targets
+    from lidarfw.types import FrameResult
 
-    stream = model.stream()
-    waiting = {frame.meta.id: frame for frame in sequence.frames}
-    done: list[FrameResult] = []
+    state, done = tracker.start(), list[FrameResult]()
     for frame in sequence.frames:
-        inputs = {"boxes": frame.boxes} | ({} if frame.pose is None else {"pose": frame.pose})
-        done += stream.advance(FrameResult(frame.meta, {}, None, Targets(), inputs))
-    for result in [*done, *stream.flush()]:
+        posed = {} if frame.pose is None else {"pose": frame.pose}
+        done += tracker.step(state, FrameResult(frame.meta), frame.boxes, **posed)
+    for frame, result in zip(sequence.frames, [*done, *tracker.flush(state)], strict=True):
         assert result.tracks is not None  # every tracker sets them
-        yield waiting[result.meta.id], result.tracks
+        yield frame, result.tracks

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -378,6 +378,12 @@ def _parse_track(values: list[str], where: str, types: Sequence[str]) -> TrackLa
     if frame < 0 or frame % 1 or track < -1 or track % 1:
         raise DataError(f"{where}: frame, track id: expected whole numbers from 0 (id -1 for none), found {values[:2]}")
     return TrackLabel(int(frame), int(track), _parse(values[2:], where, types))
+
+
+def as_object(line: TrackLabel) -> TrackLabel:
+    """A label in the terms of the object benchmark: truncation 0..1 for the levels 0..2, and its name of a type."""
+    kind = "Person_sitting" if line.label.type == "Person" else line.label.type
+    return replace(line, label=replace(line.label, type=kind, truncation=max(line.label.truncation / 2, -1.0)))
 
 
 def write_tracks(path: str | Path, labels: Sequence[TrackLabel]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lidarfw.detections import DetectedSequence, Detections
-    from lidarfw.model import PerceptionModel
+    from lidarfw.interfaces import Tracker
     from lidarfw.types import Tracks
 
     Frames = list[tuple[Detections, Tracks]]
@@ -46,11 +46,11 @@ def run(args: argparse.Namespace) -> int:
     sequences, classes, meta = _read(args)
     own = [f"--config-dir={args.config_dir}"] if args.config_dir else []
     posed = all(frame.pose is not None for sequence in sequences for frame in sequence.frames)
-    model = detections.make_tracker([*own, f"tracker={args.tracker[0]}", *args.tracker[1:]], classes, posed)
+    tracker = detections.make_tracker([*own, f"tracker={args.tracker[0]}", *args.tracker[1:]], classes)
     if not posed:
         print("note: no poses: the tracker works in the frame of the sensor, and its motion is not taken out")
     begin = time.perf_counter()
-    done = [_track(model, sequence) for sequence in _with_progress(sequences)]
+    done = [_track(tracker, sequence) for sequence in _with_progress(sequences)]
     seconds = time.perf_counter() - begin
     _write(args, sequences, done, classes, meta)
     frames = sum(len(rows) for rows in done)
@@ -89,10 +89,10 @@ def _with_progress(sequences: list[DetectedSequence]) -> Any:
     return track(sequences, "track", console=Console(stderr=True), transient=True)
 
 
-def _track(model: PerceptionModel, sequence: DetectedSequence) -> Frames:
+def _track(tracker: Tracker, sequence: DetectedSequence) -> Frames:
     from lidarfw import detections
 
-    return list(detections.track(model, sequence))
+    return list(detections.run(tracker, sequence))
 
 
 def _write(
@@ -112,3 +112,7 @@ def _write(
             detections.write_kitti(args.output / f"{sequence.name}.txt", frames, classes)
         if args.format == "json":
             detections.write_json(args.output, frames, classes)
+        if args.pictures:
+            from lidarfw import track_page
+
+            track_page.write_page(args.output / f"{sequence.name}.html", sequence.name, rows, classes)

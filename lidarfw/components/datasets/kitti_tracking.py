@@ -7,7 +7,7 @@ division of its training sequences: Weng et al., "3D multi-object tracking", IRO
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -161,7 +161,7 @@ class KittiTrackingDataset(DriveDataset):
     def _lines(self, sequence: str) -> list[kitti.TrackLabel]:
         path = self.folder / "label_02" / f"{sequence}.txt"
         types = [*kitti.TRACKING_TYPES, *(c for c in self.classes if c not in kitti.TRACKING_TYPES)]
-        lines = [_as_object(line) for line in kitti.read_tracks(path, types)]
+        lines = [kitti.as_object(line) for line in kitti.read_tracks(path, types)]
         seen = set()
         for line in lines:
             if line.id >= 0 and (line.frame, line.id) in seen:
@@ -185,12 +185,6 @@ class KittiTrackingDataset(DriveDataset):
             raise DataError(f"{self.folder / 'calib' / sequence}.txt: no key Tr_imu_velo, which OXTS poses need")
         origin = kitti.poses_from_oxts(np.stack([first, *rows]))[1:]
         return origin @ inverse(_square(calibration.imu_to_velo))
-
-
-def _as_object(line: kitti.TrackLabel) -> kitti.TrackLabel:
-    """A label in the terms of the object benchmark: truncation 0..1 for the levels 0..2, and its name of a type."""
-    kind = "Person_sitting" if line.label.type == "Person" else line.label.type
-    return replace(line, label=replace(line.label, type=kind, truncation=max(line.label.truncation / 2, -1.0)))
 
 
 def _by_frame(lines: Sequence[kitti.TrackLabel]) -> dict[int, list[kitti.TrackLabel]]:

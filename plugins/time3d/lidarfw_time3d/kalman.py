@@ -10,10 +10,11 @@ inverse, and one call serves all tracks.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 Array = npt.NDArray[np.float64]
 Int = npt.NDArray[np.int64]
@@ -31,8 +32,21 @@ class Noise:
     first_velocity: float | Array = 1e6  # of the velocity of a new track (m^2/s^2)
 
 
+class Table:
+    """Base of dataclasses whose fields are arrays with a row per track."""
+
+    def take(self, rows: Int | npt.NDArray[np.bool_]) -> Self:
+        """These rows."""
+        return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))  # type: ignore[arg-type]
+
+    def join(self, other: Self) -> Self:
+        """These rows, then the others."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))  # type: ignore[arg-type]
+        return type(self)(*(np.concatenate(pair) for pair in pairs))
+
+
 @dataclass
-class Motion:
+class Motion(Table):
     """T boxes in motion, in the tracking frame."""
 
     box: Array  # (T, 7) x, y, z, yaw, l, w, h
@@ -48,16 +62,6 @@ class Motion:
         place[:, 0], place[:, 2] = noise.first, noise.first_velocity
         speed = np.zeros((count, 3)) if velocity is None else velocity.copy()
         return cls(box.copy(), speed, place, np.broadcast_to(np.asarray(noise.first, dtype=float), count).copy())
-
-    def take(self, rows: Int | npt.NDArray[np.bool_]) -> Motion:
-        """The tracks of these rows."""
-        return Motion(self.box[rows], self.velocity[rows], self.place[rows], self.shape[rows])
-
-    def join(self, other: Motion) -> Motion:
-        """These tracks, then the others."""
-        mine, theirs = (self.box, self.velocity, self.place, self.shape), (
-            other.box, other.velocity, other.place, other.shape)  # fmt: skip
-        return Motion(*(np.concatenate(pair) for pair in zip(mine, theirs, strict=True)))
 
     def predict(self, seconds: float, frames: float, noise: Noise) -> None:
         """Move all tracks on by a time that is worth so many frames of process noise."""
