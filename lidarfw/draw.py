@@ -28,6 +28,7 @@ Picture = npt.NDArray[np.uint8]
 Extent = tuple[float, float, float, float]  # x from, x to, y from, y to, metres
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F", "#5B5B5B")
+_BY_NAME = {"static": "#A9A9A9", "moving": "#D41F1F"}
 _TRUTH = "#111111"
 _NEAR = 0.1  # metres in front of the camera, or from it, at which boxes are cut
 _EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
@@ -36,9 +37,10 @@ _DPI = 110
 _LARGE = 80  # pixels from which on a box gets thick lines
 
 
-def colour_of(label: int) -> str:
-    """The colour of a class, as #rrggbb."""
-    return COLOURS[label % len(COLOURS)]
+def colour_of(label: int, classes: Sequence[str] = ()) -> str:
+    """The colour of a class, as #rrggbb; of static and moving grey and red."""
+    name = classes[label] if 0 <= label < len(classes) else ""
+    return _BY_NAME.get(name, COLOURS[label % len(COLOURS)])
 
 
 def write_png(path: str | Path, picture: Picture) -> None:
@@ -84,7 +86,7 @@ def birds_eye(
     figure, axes = _bev_axes(extent or _extent(points, [_boxes(found), truth]))
     if points is not None and len(points):
         if labels is not None:
-            _scatter_classes(axes, points, labels)
+            _scatter_classes(axes, points, labels, classes)
         else:
             _scatter(figure, axes, points, colour)
     if truth is not None:
@@ -197,11 +199,11 @@ def _scatter(figure: Figure, axes: Axes, points: Points, colour: str) -> None:
     bar_axes.tick_params(labelsize=9)
 
 
-def _scatter_classes(axes: Axes, points: Points, labels: PointLabels) -> None:
+def _scatter_classes(axes: Axes, points: Points, labels: PointLabels, classes: Sequence[str]) -> None:
     xyz, label = points.xyz.detach().cpu().numpy(), labels.label.cpu()
     for value in np.unique(label.numpy()).tolist():
         chosen = (label == value).numpy()
-        colour, order = (colour_of(value), 3) if value >= 0 else ("#BBBBBB", 2)
+        colour, order = (colour_of(value, classes), 3) if value >= 0 else ("#BBBBBB", 2)
         axes.scatter(xyz[chosen, 1], xyz[chosen, 0], c=colour, s=_dot(len(xyz)), linewidths=0, zorder=order)
 
 
@@ -247,7 +249,8 @@ def _legend(axes: Axes, labels: Tensor | None, truth: Boxes | None, classes: Seq
     counts = labels[labels >= 0].bincount(minlength=len(classes)).tolist() if labels is not None else []
     for label, count in enumerate(counts):
         name = classes[label] if label < len(classes) else f"class {label}"
-        handles.append(Line2D([], [], color=colour_of(label), linewidth=2, label=f"{name} ({count})"))
+        colour = colour_of(label, classes)
+        handles.append(Line2D([], [], color=colour, linewidth=2, label=f"{name} ({count})"))
     if truth is not None:
         dashes = (0, (4, 2))
         handles.append(Line2D([], [], color=_TRUTH, linestyle=dashes, label=f"ground truth ({len(truth)})"))
@@ -474,6 +477,48 @@ def range_picture(image: RangeImage, sample: int = 0, scale: int = 4) -> Picture
     rows.insert(1, np.full((2, mask.shape[1], 3), 255, np.uint8))
     stacked = np.concatenate(rows)
     return stacked.repeat(scale, 0)
+
+
+def range_labels(
+    image: RangeImage, points: Points, labels: PointLabels, classes: Sequence[str] = (), scale: int = 4
+) -> Picture:
+    """Labels of the points of one scan in their range image, in the colours of the classes, rows `scale` times.
+
+    `points` are those that the image was made of; the nearest one of a pixel counts. Brightness is nearness; black
+    has no point, grey one that is static or has no class.
+    """
+    height, width = image.mask.shape[1:]
+    distance = points.xyz.norm(dim=1).cpu().numpy()
+    order = np.argsort(-distance, kind="stable")  # of several points in a pixel the nearest is written last
+    pixel = image.pixel.cpu().numpy()[order]
+    label, near = np.full(height * width, -1), np.zeros(height * width)
+    label[pixel[pixel >= 0]] = labels.label.cpu().numpy()[order][pixel >= 0]
+    near[pixel[pixel >= 0]] = 1 / (1 + distance[order][pixel >= 0] / 20)
+    names = [colour_of(number, classes) for number in range(int(label.max(initial=0)) + 1)]
+    colours = np.array([_rgb(colour) for colour in [*names, _BY_NAME["static"]]])[label]
+    grey = (label < 0) | np.isin(label, [n for n, name in enumerate(classes) if name == "static"])
+    shade = np.where(grey, near, 0.4 + 0.6 * near) * (near > 0)
+    return (colours * shade[:, None]).astype(np.uint8).reshape(height, width, 3).repeat(scale, 0)
+
+
+def side_by_side(pictures: Sequence[Picture], columns: int, width: int) -> Picture:
+    """Pictures in rows of `columns`, each scaled to `width` pixels, with white between them."""
+    import cv2
+
+    scaled = [
+        cv2.resize(p, (width, round(p.shape[0] * width / p.shape[1])), interpolation=cv2.INTER_AREA) for p in pictures
+    ]
+    rows = [scaled[first : first + columns] for first in range(0, len(scaled), columns)]
+    return np.concatenate([_row_of(row, columns, width) for row in rows])
+
+
+def _row_of(pictures: Sequence[Picture], columns: int, width: int, gap: int = 6) -> Picture:
+    height = max(picture.shape[0] for picture in pictures)
+    row = np.full((height + gap, columns * (width + gap), 3), 255, np.uint8)
+    for number, picture in enumerate(pictures):
+        left = number * (width + gap)
+        row[: picture.shape[0], left : left + width] = picture
+    return row
 
 
 # Curves

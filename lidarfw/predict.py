@@ -32,12 +32,13 @@ from lidarfw.types import (
     PointLabels,
     Points,
     Poses,
+    RangeImage,
     Spec,
     Targets,
 )
 
 PERIOD = 0.1  # seconds between the scans of a folder, where nothing says otherwise
-FORMATS = ("json", "npz", "kitti")
+FORMATS = ("json", "npz", "kitti", "label")
 _SHOWN = 400  # points of a scan in the picture of a trajectory
 
 
@@ -165,7 +166,14 @@ class FrameReader:
 def needed_inputs(model: PerceptionModel) -> set[str]:
     """Names of the data inputs that the parts of the model read at inference."""
     slots = ("backbone", "neck", "head", "postprocessor", "filter", "tracker", "retriever")
-    refs = [ref for slot in slots for step in model.plan.of(slot) for found in step.takes.values() for ref in found]
+    refs = [
+        ref
+        for slot in slots
+        for step in model.plan.of(slot)
+        for p in step.parameters
+        for ref in step.takes[p.name]
+        if not p.optional
+    ]
     return {ref.producer.removeprefix("data.") for ref in refs if ref.producer.startswith("data.")}
 
 
@@ -280,7 +288,7 @@ def keep_scores(result: FrameResult, score: float) -> FrameResult:
 
 
 def save(result: FrameResult, folder: Path, form: str, classes: Sequence[str]) -> list[Path]:
-    """Write one result as `form` (json, npz, kitti); the files, named by the frame."""
+    """Write one result as `form` (json, npz, kitti, label); the files, named by the frame."""
     if form == "json":
         path = folder / f"{result.meta.id}.json"
         write_text(path, _json(to_plain(result, classes)))
@@ -290,6 +298,10 @@ def save(result: FrameResult, folder: Path, form: str, classes: Sequence[str]) -
         with atomic_path(path) as temporary:
             np.savez_compressed(temporary, allow_pickle=False, **_arrays(result, classes))
         return [path]
+    if form == "label":
+        from lidarfw.drive_prediction import save_labels
+
+        return [save_labels(result, folder, classes)]
     return _save_kitti(result, folder, classes)
 
 
@@ -366,7 +378,8 @@ def _arrays(result: FrameResult, classes: Sequence[str]) -> dict[str, np.ndarray
 def save_pictures(
     result: FrameResult, folder: Path, classes: Sequence[str], extent: draw.Extent | None = None
 ) -> list[Path]:
-    """ID_bev.png with the scan from above, and ID_image.png where picture and calibration are known."""
+    """ID_bev.png with the scan from above, ID_range.png of labels in a range image, and ID_image.png where picture and
+    calibration are known."""
     pictures = pictures_of(result, classes, extent)
     paths = [folder / f"{result.meta.id}_{name}.png" for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
@@ -392,7 +405,8 @@ def _flat(provided: Any) -> list[Spec]:
 def pictures_of(
     result: FrameResult, classes: Sequence[str], extent: draw.Extent | None = None
 ) -> dict[str, draw.Picture]:
-    """Pictures of a result by name: bev (of `extent`, by default of all points), image. Truth is drawn where known."""
+    """Pictures of a result by name: bev (of `extent`, by default of all points), range (labels in the range image),
+    image. Truth is drawn where known."""
     found = result.tracks or _all_boxes(result)
     truth = result.targets.boxes if result.targets else None
     pictures = {}
@@ -401,6 +415,9 @@ def pictures_of(
         labels = next((value for value in result.predictions.values() if isinstance(value, PointLabels)), None)
         title = result.meta.id
         pictures["bev"] = draw.birds_eye(scan, found, truth, classes, labels=labels, extent=extent, title=title)
+        image = next((value for value in result.inputs.values() if isinstance(value, RangeImage)), None)
+        if labels is not None and image is not None:
+            pictures["range"] = draw.range_labels(image, scan, labels, classes)
     camera = result.meta.cameras.get(kitti.IMAGE)
     picture = _picture_of(result)
     if camera is not None and picture is not None and found is not None:

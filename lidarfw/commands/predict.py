@@ -19,14 +19,22 @@ T = TypeVar("T")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw predict`."""
     parser.add_argument("checkpoint", metavar="CKPT", help="of `lidarfw train`; nothing else is needed")
-    parser.add_argument("scans", metavar="SCAN", nargs="*", help=".bin .pcd .ply .npy .npz .png .jpg, or a folder")
+    parser.add_argument(
+        "scans",
+        metavar="SCAN",
+        nargs="*",
+        help=".bin .pcd .ply .npy .npz .png .jpg, or a folder of them; or one sequence in SemanticKITTI's layout",
+    )
     parser.add_argument(
         "--split", metavar="NAME", help="instead of scans: a split of the dataset it learned from, with the truth"
     )
     parser.add_argument("--poses", metavar="FILE", type=Path, help="true poses, 12 numbers a line and scan, to compare")
     parser.add_argument("--map", metavar="FILE", type=Path, help="points of the map, behind the trajectory")
     parser.add_argument("-o", "--output", metavar="DIR", default="predictions", help="folder to write to (%(default)s)")
-    parser.add_argument("--format", choices=("json", "npz", "kitti"), default="json", help="of results (%(default)s)")
+    parser.add_argument(
+        "--format", choices=("json", "npz", "kitti", "label"), help="of results (json; label for a sequence of labels)"
+    )
+    parser.add_argument("--static-map", metavar="FILE", type=Path, help="PLY of what does not move in a sequence")
     parser.add_argument("--calib", metavar="FILE", type=Path, help="KITTI calibration; in KITTI's layout it is found")
     parser.add_argument("--image", metavar="FILE", type=Path, help="picture; in KITTI's layout it is found")
     parser.add_argument(
@@ -40,7 +48,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Predict every scan."""
+    """Predict every scan, or a whole sequence."""
+    from lidarfw.drive_prediction import is_sequence
+
+    if len(args.scans) == 1 and is_sequence(Path(args.scans[0])):
+        return _run_sequence(args)
+    return _run_scans(args)
+
+
+def _run_scans(args: argparse.Namespace) -> int:
     import torch
 
     import lidarfw
@@ -60,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     for number, result in enumerate(predict.predict_frames(model, frames, args.stream)):
         seconds = time.perf_counter() - begin
         shown = predict.keep_scores(result, args.score)
-        predict.save(shown, folder, args.format, classes)
+        predict.save(shown, folder, args.format or "json", classes)
         if not args.no_pictures:
             predict.save_pictures(shown, folder, classes, extent)
         path.add(shown, None if truth is None else truth[number])
@@ -71,6 +87,41 @@ def run(args: argparse.Namespace) -> int:
         print(path.summary())
         if not args.no_pictures:
             draw.write_png(folder / "trajectory.png", path.picture())
+    return 0
+
+
+def _run_sequence(args: argparse.Namespace) -> int:
+    """A sequence in order of time: results of every frame, one strip of pictures, the map of what stands still."""
+    import torch
+
+    import lidarfw
+    from lidarfw import draw, drive_prediction, predict
+    from lidarfw.types import PointLabels
+
+    model = lidarfw.load(Path(args.checkpoint)).to("cuda" if torch.cuda.is_available() else "cpu")
+    frames = drive_prediction.SequenceFrames(model, Path(args.scans[0]))
+    classes, folder = model.plan.data.classes, Path(args.output)
+    strip = drive_prediction.Strip(len(frames), classes)
+    still = drive_prediction.StaticMap(classes=classes) if args.static_map else None
+    rows = []
+    begin = time.perf_counter()
+    for result in predict.predict_frames(model, (frames[i] for i in _with_progress(range(len(frames)))), stream=True):
+        seconds = time.perf_counter() - begin
+        shown = predict.keep_scores(result, args.score)
+        labelled = any(isinstance(value, PointLabels) for value in shown.predictions.values())
+        predict.save(shown, folder, args.format or ("label" if labelled else "json"), classes)
+        if not args.no_pictures:
+            strip.add(shown)
+        if still is not None:
+            still.add(shown)
+        rows.append(_row(shown, classes, seconds))
+        begin = time.perf_counter()
+    _print_table(rows, (), folder)
+    if strip.pictures:
+        draw.write_png(folder / "strip.png", strip.picture())
+    if still is not None:
+        still.write(args.static_map)
+        print(f"static map of {len(still.cells)} points: {args.static_map}")
     return 0
 
 
@@ -103,16 +154,21 @@ def _with_progress(items: Sequence[T]) -> Iterator[T]:
 
 
 def _row(result: FrameResult, classes: Sequence[str], seconds: float) -> list[str]:
-    from lidarfw.types import Boxes, Points
+    from lidarfw.types import Boxes, PointLabels, Points
 
     points = sum(len(value) for value in result.inputs.values() if isinstance(value, Points))
     boxes = [value for value in result.predictions.values() if isinstance(value, Boxes)]
     found = [classes[label] for value in boxes for label in value.label.tolist()]
     counts = ", ".join(f"{found.count(name)} {name}" for name in classes if name in found)
     best = max((float(value.score.max()) for value in boxes if len(value)), default=None)
+    moving = [
+        f"{int((v.label == classes.index('moving')).sum())} moving points"
+        for v in result.predictions.values()
+        if isinstance(v, PointLabels) and "moving" in classes
+    ]
     others = ", ".join(f"{type(v).__name__}" for v in result.predictions.values() if not isinstance(v, Boxes))
     tracks = f"{len(result.tracks.id)} tracks" if result.tracks is not None else ""
-    what = "; ".join(text for text in (counts or ("no boxes" if boxes else ""), tracks, others) if text)
+    what = "; ".join(text for text in (counts or ("no boxes" if boxes else ""), tracks, *moving, others) if text)
     return [result.meta.id, str(points), what, "-" if best is None else f"{best:.2f}", f"{seconds:.2f}"]
 
 

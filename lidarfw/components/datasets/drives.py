@@ -115,14 +115,19 @@ class DriveDataset(Dataset):
 
     def merged(self, scans: Sequence[Points], drive: Drive, place: int) -> Points:
         """The scans of a frame as one, in the frame of the first."""
-        if self.sweeps == 1:
-            return scans[0]
-        moved = [_moved(scan, drive, past, place) for scan, past in zip(scans, self.recent(place), strict=True)]
-        return Points.cat(moved)
+        return scans[0] if self.sweeps == 1 else merge_scans(scans, drive, self.recent(place))
 
     def scan(self, drive: Drive, place: int) -> Points:
         """One scan in its own frame: x, y, z and remission 0..1."""
         return read_scan(drive.scans[place])
+
+
+def merge_scans(scans: Sequence[Points], drive: Drive, places: Sequence[int]) -> Points:
+    """The scans at these places of a drive as one, in the frame of the first, with times relative to it.
+
+    Raises ConfigError for a drive without poses.
+    """
+    return Points.cat([_moved(scan, drive, past, places[0]) for scan, past in zip(scans, places, strict=True)])
 
 
 def _moved(scan: Points, drive: Drive, past: int, now: int) -> Points:

@@ -6,6 +6,7 @@ moving classes: Chen et al., "Moving object segmentation in 3D LiDAR data", RA-L
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -51,6 +52,8 @@ _IDS = {
     256: "other-vehicle", 257: "other-vehicle", 258: "truck", 259: "other-vehicle",
 }  # fmt: skip
 _FIRST_MOVING = 251
+_STATIC_ID = 9
+_LANE = (60,)  # lane markings count as road, whose own id is 40
 TASKS = {"semantics": CLASSES, "moving": MOVING}
 _PERIOD = 0.1  # seconds between scans without times.txt
 _UNKNOWN = -2  # in the tables below: an id that the dataset does not have
@@ -70,6 +73,35 @@ def _table(task: str) -> npt.NDArray[np.int64]:
 
 def _numbers(*numbers: int) -> tuple[str, ...]:
     return tuple(f"{number:02d}" for number in numbers)
+
+
+def read_sequence(folder: Path) -> Drive:
+    """Scans, times and LiDAR poses of one sequence, from its folder; DataError where a file is missing or broken."""
+    scans = scans_in(folder / "velodyne")
+    numbers = [int(scan.stem) for scan in scans]
+    times = _times(folder / "times.txt", numbers)
+    cameras = rows_of(read_poses(folder / "poses.txt"), numbers, folder / "poses.txt")
+    extrinsics = _extrinsics(folder / "calib.txt")
+    return Drive(folder.name, scans, times, inverse(extrinsics) @ cameras @ extrinsics)
+
+
+def label_ids(classes: Sequence[str]) -> npt.NDArray[np.uint32]:
+    """The id (K + 1,) that a label file has for each class, and at the end the one of points without a class.
+
+    As the evaluation of the benchmarks reads them: 9 and 251 for static and moving, where no class means static; the
+    ids of SemanticKITTI for its classes, where it is 0. ConfigError for classes that it does not have.
+    """
+    if set(classes) == set(MOVING):
+        return np.array([_STATIC_ID if name == "static" else _FIRST_MOVING for name in classes] + [_STATIC_ID], "<u4")
+    known = {
+        name: max(i for i, n in _IDS.items() if n == name and i not in _LANE and i < _FIRST_MOVING) for name in CLASSES
+    }
+    unknown = [name for name in classes if name not in known]
+    if unknown:
+        raise ConfigError(
+            f"SemanticKITTI has no class '{unknown[0]}'.\n  its classes: {', '.join(CLASSES)}; or {', '.join(MOVING)}"
+        )
+    return np.array([known[name] for name in classes] + [0], "<u4")
 
 
 class SemanticKittiDataset(DriveDataset):
@@ -130,13 +162,7 @@ class SemanticKittiDataset(DriveDataset):
 
     def open(self, sequence: str) -> Drive:
         """Scans, times and LiDAR poses of a sequence."""
-        folder = self.folder / sequence
-        scans = scans_in(folder / "velodyne")
-        numbers = [int(scan.stem) for scan in scans]
-        times = _times(folder / "times.txt", numbers)
-        cameras = rows_of(read_poses(folder / "poses.txt"), numbers, folder / "poses.txt")
-        extrinsics = _extrinsics(folder / "calib.txt")
-        return Drive(sequence, scans, times, inverse(extrinsics) @ cameras @ extrinsics)
+        return read_sequence(self.folder / sequence)
 
     def prepare(self) -> None:
         """Check that every scan of the split has its labels."""

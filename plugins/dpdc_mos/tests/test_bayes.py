@@ -10,6 +10,7 @@ import pytest
 import torch
 from lidarfw.errors import ConfigError
 from lidarfw.types import Boxes, DataSpec, FrameMeta, FrameResult, PointLabels, Points, Poses, Spec
+
 from lidarfw_dpdc_mos.bayes import BayesFilter, BayesState
 
 LABELS = Spec(PointLabels, classes=("static", "moving"))

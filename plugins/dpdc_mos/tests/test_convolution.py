@@ -9,8 +9,9 @@ import torch
 from lidarfw import merge
 from lidarfw.components.layers import BatchNorm2d
 from lidarfw.errors import ConfigError
-from lidarfw_dpdc_mos.convolution import BRANCHES, FIVE, DPDC2d, RangeConv2d, convolve, go_round
 from torch import Tensor, nn
+
+from lidarfw_dpdc_mos.convolution import BRANCHES, FIVE, DPDC2d, RangeConv2d, convolve, go_round
 
 THREE = {
     "cdc": [[1, 2, 3], [4, -36, 5], [6, 7, 8]],

@@ -7,6 +7,8 @@ import pytest
 import torch
 from lidarfw.errors import ConfigError
 from lidarfw.types import PointLabels, Spec
+from torch import Tensor
+
 from lidarfw_dpdc_mos.distance import distance_maps, signed_distance
 from lidarfw_dpdc_mos.losses import (
     EdgeAwareLoss,
@@ -15,7 +17,6 @@ from lidarfw_dpdc_mos.losses import (
     lovasz_softmax,
     weighted_cross_entropy,
 )
-from torch import Tensor
 
 CLASSES = Spec(PointLabels, classes=("static", "moving"))
 

@@ -9,11 +9,12 @@ import torch
 from lidarfw import merge
 from lidarfw.errors import AssemblyError, ConfigError
 from lidarfw.types import DataSpec, Points, RangeImage, RangeView, Spec
+from torch import nn
+
 from lidarfw_dpdc_mos.backbone import DPDCBackbone
 from lidarfw_dpdc_mos.blocks import MetaKernel, MotionGuidedAttention, SoftPool2d
 from lidarfw_dpdc_mos.convolution import DPDC2d
 from lidarfw_dpdc_mos.schedule import WarmupRestarts
-from torch import nn
 
 VIEW = RangeView(16, 64, math.radians(3), math.radians(-25))
 DATA = DataSpec({"points": Spec(Points, 1)})

@@ -9,6 +9,7 @@ import pytest
 import torch
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.types import Frame, FrameMeta, PointLabels, Points, RangeImage, RangeView, Spec, Targets
+
 from lidarfw_dpdc_mos.postprocessors import KnnLabels
 from lidarfw_dpdc_mos.transforms import RangeProjection
 

@@ -11,9 +11,10 @@ from lidarfw.components.transforms.augmentation import RandomFlip, RandomRotatio
 from lidarfw.errors import ConfigError
 from lidarfw.testing.synthetic import SyntheticDataset
 from lidarfw.types import DataSpec, Frame, FrameMeta, PointLabels, Points, RangeImage, Spec, Targets
+from torch import Tensor
+
 from lidarfw_dpdc_mos.distance import on_pixels
 from lidarfw_dpdc_mos.transforms import EdgeDistance, RangeProjection, ResidualImages
-from torch import Tensor
 
 RNG = np.random.default_rng(0)
 
