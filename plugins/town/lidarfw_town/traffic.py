@@ -379,8 +379,8 @@ def _near(places: Array, others: Array, reach: float | Array, *, each: bool = Fa
 
     With `each`, (V, L, W, P): of which point.
     """
-    apart = places[:, :, None, None] - others
-    close = (apart**2).sum(-1) < reach**2
+    east, north = (places[:, :, None, None, axis] - others[..., axis] for axis in (0, 1))
+    close = east * east + north * north < reach**2
     return np.asarray(close if each else close.any(-1))
 
 
