@@ -280,19 +280,23 @@ def main() -> None:
     parser.add_argument("--poses", type=Path, help="3 x 4 poses of camera 0")
     parser.add_argument("--view", type=float, default=1.4, help="field of view, radians (%(default)s)")
     parser.add_argument("--folds", type=int, default=0, help="cross-validate by sequence, and write nothing")
+    parser.add_argument(
+        "--option", nargs="+", default=[], metavar="NAME=NUMBER", help="of the tracker: min_unseen=2 (nothing coasted)"
+    )
     parser.add_argument("-o", "--output", type=Path, default=Path("weights.json"))
     arguments = parser.parse_args()
+    options = {name: float(value) for name, _, value in (text.partition("=") for text in arguments.option)}
     torch.set_num_threads(1)
     classes = detections.kitti_classes(arguments.detections)
     data = read(arguments.detections, arguments.labels, arguments.calib, arguments.poses, classes)
     if arguments.folds:
-        found = cross_validate(data, classes, arguments.view, arguments.folds)
+        found = cross_validate(data, classes, arguments.view, arguments.folds, **options)
         for rules, figures in found.items():
             for name in classes:
                 shown = {key: figures.get(f"{name.lower()}_{key}", float("nan")) for key in ("samota", "mota", "ids")}
                 print(rules, name, " ".join(f"{key} {value:.4f}" for key, value in shown.items()))
         return
-    learnt = fit(data, classes, arguments.view)
+    learnt = fit(data, classes, arguments.view, **options)
     write_text(arguments.output, json.dumps(learnt))
     print(f"{arguments.output}: calibration {learnt['calibration']}")
 

@@ -11,11 +11,12 @@ from lidarfw.interfaces import Tracker
 from lidarfw.types import Boxes, FrameResult, Poses, Spec, Tracks
 
 from lidarfw_time3d.assignment import gated_hungarian
-from lidarfw_time3d.confidence import Confidence, Evidence, features, log_odds
+from lidarfw_time3d.confidence import FEATURES, Confidence, Evidence, features, log_odds
 from lidarfw_time3d.frames import array, boxes_of, pose_of, rows_of, seconds_since, to_map, to_sensor
 from lidarfw_time3d.kalman import Array, Int, Motion, Noise
 
 NOISE = Noise(measured=0.1, place=0.02, shape=0.01, velocity=0.2, first=0.1, first_velocity=100.0)
+_RIVAL = FEATURES.index("rival_same")
 _REST = 0.7  # m/s below which an unseen object is taken to stand still
 _NEWBORN = 1.5  # times the gate for a track whose velocity is not known yet
 _GROWTH = 0.12  # of the gate per unseen frame
@@ -48,7 +49,8 @@ class KalmanConfidence(Tracker):
     age, scores, distance from the prediction, rivals at the same place) it gives the probability that its box is
     right, which is the score of the box. A detected box comes out from `min_seen`, an unseen one (coasted: moved on
     by the track's velocity) from `min_unseen`, as long as its centre is within `field_of_view` (radians about the
-    forward axis). A track ends when it is unseen for `max_age` frames, or unseen and hopeless.
+    forward axis). A track ends when it is unseen for `max_age` frames, unseen and hopeless, or unseen where a better
+    one of its class is.
 
     Scores of the detector are probabilities, or are made log-odds by `calibration`, scale and offset by class name.
     `weights` names a file of `python -m lidarfw_time3d.fit`; empty: those that were learned on KITTI's boxes.
@@ -100,9 +102,12 @@ class KalmanConfidence(Tracker):
         score = log_odds(array(boxes.score), label, self.calibration)
         self.advance(state, to_map(rows_of(boxes), state.pose), label, score, passed)
         box = to_sensor(state.motion.box, state.pose)
-        chance = self.confidence.probability(self.features(state, box), state.label, self.classes)
-        tracks = self._tracks(state, box, chance, boxes)
-        self._end(state, chance)
+        values = self.features(state, box)
+        chance = self.confidence.probability(values, state.label, self.classes)
+        # an unseen track with a better one of its class at its place is a second track of the same object
+        double = (state.evidence.missed > 0) & (values[:, _RIVAL] > state.evidence.last - 2)
+        tracks = self._tracks(state, box, np.where(double, 0, chance), boxes)
+        self._end(state, np.where(double, -1, chance))
         return [replace(frame, tracks=tracks)]
 
     def advance(self, state: KalmanConfidenceState, found: Array, label: Int, score: Array, passed: float) -> None:
