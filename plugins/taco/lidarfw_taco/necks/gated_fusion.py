@@ -42,8 +42,7 @@ class GatedFusion(Neck):
         super().__init__()
         *fine, deepest = sorted(voxels, key=lambda spec: spec.stride)
         self.gates = nn.ModuleList(_Gate(spec.channels, deepest.channels, channels) for spec in fine)
-        scan = nn.Sequential(nn.Linear(deepest.channels, context, bias=False), BatchNorm1d(context), nn.ReLU())
-        self.context = scan if context else None
+        self.context = _context(deepest.channels, context) if context else None
         width = deepest.channels + channels * len(fine) + context
         self.provides = Spec(Voxels, width, deepest.stride, deepest.geometry, depth=deepest.depth)
 
@@ -57,6 +56,10 @@ class GatedFusion(Neck):
             batch = deepest.index[:, 0]
             parts.append(scatter_mean(self.context(deepest.features), batch, deepest.batch_size)[batch])
         return deepest.with_features(torch.cat(parts, 1))
+
+
+def _context(in_channels: int, channels: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(in_channels, channels, bias=False), BatchNorm1d(channels), nn.ReLU())
 
 
 def averaged(fine: Voxels, coarse: Voxels) -> Tensor:
