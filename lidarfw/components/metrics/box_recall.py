@@ -87,4 +87,5 @@ def _key(name: str) -> str:
 
 def _range(boxes: Boxes) -> Tensor:
     """Metres (N,) on the level from the sensor."""
-    return boxes.center[:, :2].norm(dim=1)
+    distance: Tensor = boxes.center[:, :2].norm(dim=1)
+    return distance
