@@ -191,7 +191,9 @@ def close_pairs(a: Tensor, b: Tensor) -> Tensor:
     return close
 
 
-def overlap_at(a: Tensor, b: Tensor, pairs: Tensor, measure: Callable[[Tensor, Tensor], Tensor] = plane_ratio) -> Tensor:
+def overlap_at(
+    a: Tensor, b: Tensor, pairs: Tensor, measure: Callable[[Tensor, Tensor], Tensor] = plane_ratio
+) -> Tensor:
     """`measure` (P,) of the boxes a[pairs[:, 0]] and b[pairs[:, 1]], in chunks."""
     chunks = pairs.split(_PAIRS)  # type: ignore[no-untyped-call]
     values = [measure(a[p[:, 0]].t().contiguous(), b[p[:, 1]].t().contiguous()) for p in chunks]
