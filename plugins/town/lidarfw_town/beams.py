@@ -54,12 +54,12 @@ class Body:
 
         `pose` (4, 4) is that of the LiDAR when it passes the body, `travel` the way of the vehicle in a turn, metres.
         """
-        corners = _corners(self.mesh) @ self.turn.T + self.place
+        corners = self.mesh.corners @ self.turn.T + self.place
         local = (corners - pose[:3, 3]) @ pose[:3, :3]
         middle = float(np.arctan2(*local.mean(0)[1::-1]))
         margin = _MARGIN + (travel if abs(middle) > _BEHIND else 0.0)
         flat = np.hypot(local[:, 0], local[:, 1])
-        nearest = _nearest(_corners(self.mesh), self.turn.T @ (pose[:3, 3] - self.place)) - margin
+        nearest = _nearest(self.mesh.corners, self.turn.T @ (pose[:3, 3] - self.place)) - margin
         low, high = float(local[:, 2].min()) - margin, float(local[:, 2].max()) + margin
         if nearest < 0.5:
             return np.arange(len(lidar.elevations) * lidar.columns)
@@ -69,12 +69,6 @@ class Body:
         aside = np.angle(np.exp(1j * (np.arctan2(local[:, 1], local[:, 0]) - middle)))
         spread = np.arcsin(min(margin / nearest, 1.0))
         return _rows(lidar, middle + aside.min() - spread, middle + aside.max() + spread, down, up)
-
-
-def _corners(mesh: Mesh) -> Array:
-    """Corners (8, 3) of the upright box around a mesh."""
-    low, high = mesh.bounds
-    return np.stack(np.meshgrid(*zip(low, high), indexing="ij"), -1).reshape(8, 3)
 
 
 def _nearest(corners: Array, place: Array) -> float:

@@ -158,14 +158,14 @@ class Drive:
         """What the beams meet first; and how many would reach an object that stood alone, of those that some reach."""
         hits = first_hits([self.still], origins, directions)
         travel = float(np.linalg.norm(origins[0] - origins[-1]))
-        windows = {body.id: body.window(self.lidar, frame, travel) for _, body, _, frame in bodies}
-        beams = {}
-        for thing, body, _, _ in bodies:
-            rows = windows[body.id]
-            if isinstance(thing, Mover) or (hits.instance[rows] == body.id).any():
+        standing, beams = set(_counts(hits.instance)), {}
+        for thing, body, _, frame in bodies:
+            moves = isinstance(thing, Mover)
+            if moves or body.id in standing:
+                rows = body.window(self.lidar, frame, travel)
                 distance, triangle, normal = body.meet(origins[rows], directions[rows])
                 beams[body.id] = int((triangle >= 0).sum())
-                if isinstance(thing, Mover):
+                if moves:
                     merge(hits, body, rows, distance, triangle, normal)
         return hits, beams
 

@@ -72,9 +72,10 @@ class Mesh:
         return len(self.triangles)
 
     @functools.cached_property
-    def bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest x, y, z."""
-        return self.triangles.min((0, 1)).astype(np.float64), self.triangles.max((0, 1)).astype(np.float64)
+    def corners(self) -> Array:
+        """Corners (8, 3) of the upright box around the mesh, the lowest first, the highest last."""
+        places = self.triangles.reshape(-1, 3).astype(np.float64)
+        return np.stack(np.meshgrid(*zip(places.min(0), places.max(0)), indexing="ij"), -1).reshape(8, 3)
 
     @functools.cached_property
     def panes(self) -> npt.NDArray[np.int64]:
