@@ -22,7 +22,7 @@ MEANING = {
     SUPPORTED: "the interval lies on the claimed side of 0, and so do at least two thirds of the seeds",
     CONTRADICTED: "the interval lies on the other side of 0",
     NEUTRAL: "the interval lies within the margin around 0: whatever effect there is, it is small",
-    UNDECIDED: "the interval holds 0 and reaches beyond the margin: these runs cannot tell",
+    UNDECIDED: "the interval holds 0 and reaches beyond the margin, or all figures are 0: these runs cannot tell",
 }
 
 
@@ -64,7 +64,10 @@ def judge(claim: Claim, baseline: Mapping[int, Mapping[str, Any]] | float, varia
     per_seed = ours - (theirs if claim.paired else mean)
     sign, margin = (1 if claim.better == "higher" else -1), claim.margin_of(mean)
     worst, best = sorted((sign * low, sign * high))
-    verdict = _verdict(worst, best, sign * per_seed, margin)
+    measured = bool(
+        np.any(ours) or np.any(theirs)
+    )  # a figure that is 0 in all runs, as of a detector that finds nothing
+    verdict = _verdict(worst, best, sign * per_seed, margin) if measured else UNDECIDED
     by_seed = dict(zip(variant, per_seed.tolist(), strict=True))
     return Outcome(verdict, mean, float(ours.mean()), float(ours.mean() - mean), low, high, by_seed, margin)
 

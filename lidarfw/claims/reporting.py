@@ -147,7 +147,7 @@ def _how(stated: ClaimsFile, done: Sequence[Mapping[str, Any]], command: str) ->
         "## How it was measured\n",
         f"`{command}`, {date.today().isoformat()}, lidarfw {__version__}, commit {commit() or 'unknown'}, "
         f"{platform.machine()} with {os.cpu_count()} cores. Wall time of all runs together: "
-        f"{sum(seconds.values()) / 60:.0f} minutes.\n",
+        f"{sum(seconds.values()) / 60:.0f} minutes; several run at once.\n",
         f"Differences are variant less baseline. An interval is the middle 90 % of {stated.resamples} bootstrap "
         "samples. A sample draws the seeds with replacement and, for all seeds alike, the test frames, in blocks of "
         f"{stated.block} consecutive frames of a sequence; figures such as average precision are computed anew on the "
@@ -206,7 +206,7 @@ def forest_plot(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
     axes.axvline(0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(entries)), [_label(entry) for entry in reversed(entries)], fontsize=9)
     axes.set_ylim(-0.6, len(entries) - 0.4)
-    axes.set_xlabel("gain of the variant over the baseline (% of the baseline's figure), 90 % interval")
+    axes.set_xlabel("← worse      gain over the baseline (% of its figure), 90 % interval; dots: seeds      better →")
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right", "left"]].set_visible(False)
     handles = [

@@ -225,6 +225,7 @@ class Runner:
         self.work, self.jobs, self.threads, self.launcher = work, jobs, threads, launcher
         self.start = start or start_process
         self.deadline = time.monotonic() + 60 * minutes if minutes is not None else None
+        self.done = 0  # jobs
         self.failed: dict[Path, str] = {}  # folder -> why
         self.busy: list[Job] = []  # another runner is at them
         self._active: list[Active] = []
@@ -232,7 +233,6 @@ class Runner:
     def run(self, display: Display | None = None) -> None:
         """Run until nothing is left that can end in time. What fails is noted in `failed`; the others go on."""
         waiting = self.work.left
-        total = len(waiting)
         try:
             if self.launcher:
                 self._launch([job for job in waiting if not job.trained], display)
@@ -242,7 +242,7 @@ class Runner:
                     self._begin(waiting.pop(0))
                 self._collect()
                 if display is not None:
-                    display.update(self._active, total - len(waiting) - len(self._active))
+                    display.update(self._active, self.done)
                 time.sleep(_PAUSE)
         finally:
             self._stop()
@@ -270,6 +270,7 @@ class Runner:
         """Start what comes next of a job, or let it go."""
         found = next(_commands(job, self.work.stated), None)
         if found is None:
+            self.done += 1
             lock.close()
             return
         what, arguments = found

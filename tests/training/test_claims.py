@@ -349,6 +349,13 @@ def test_verdicts():
     assert judging.judge(claim(margin=0.05), base, evaluated(0.7, 1.32, 0.98)).verdict == judging.UNDECIDED
 
 
+def test_figures_that_are_0_in_all_runs_tell_nothing():
+    nothing = evaluated(1.0, 1.0, 1.0)
+    for content in nothing.values():
+        content["figures"]["m/x"], content["resampled"]["m/x"] = 0.0, [0.0] * 400
+    assert judging.judge(claim(), nothing, nothing).verdict == judging.UNDECIDED
+
+
 def test_pairing_removes_what_both_runs_share():
     base, better = evaluated(1.0, 1.0, 1.0), evaluated(0.95, 0.95, 0.95)
     paired, single = judging.judge(claim(), base, better), judging.judge(claim(paired=False), base, better)

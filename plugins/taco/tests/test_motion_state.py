@@ -170,3 +170,12 @@ def test_it_needs_boxes():
         MotionState().spec(DataSpec({}, frozenset({Poses})))
     with pytest.raises(ConfigError, match="need speed >= 0 and reach > 0"):
         MotionState(reach=0)
+
+
+def test_shuffled_states_are_a_control():
+    dataset = Drive([PARKED, FAST, WALKER, SLOW])
+    transform = MotionState(shuffle=True)
+    transform.attach(dataset)
+    found = [tuple(transform(dataset[3], np.random.default_rng(i)).targets.boxes.moving.tolist()) for i in range(20)]
+    assert len(set(found)) > 3
+    assert all(sum(states) == 2 for states in found)

@@ -43,15 +43,19 @@ class MotionState(Transform):
 
     The first frame of a sequence that is asked for reads the whole sequence. For large datasets name a `file`:
     `lidarfw prepare`, or the training itself, then works all states out once and keeps them there. With `overwrite`
-    false, a state that the dataset knows (not -1) stays.
+    false, a state that the dataset knows (not -1) stays. `shuffle` is a control: the states are dealt out anew among
+    the objects of each frame, so that nothing which learns from them can gain.
     """
 
     example: ClassVar[dict[str, Any]] = {}
 
-    def __init__(self, *, speed: float = 0.5, reach: float = 0.25, overwrite: bool = True, file: str = "") -> None:
+    def __init__(
+        self, *, speed: float = 0.5, reach: float = 0.25, overwrite: bool = True, file: str = "", shuffle: bool = False
+    ) -> None:
         if speed < 0 or reach <= 0:
             raise ConfigError(f"motion_state: need speed >= 0 and reach > 0, got {speed} and {reach}")
         self.speed, self.reach, self.overwrite, self.file = speed, reach, overwrite, file
+        self.shuffle = shuffle
         self._dataset: Dataset | None = None
         self._places: dict[str, tuple[int, int]] = {}  # frame id -> sequence, place in it
         self._states: dict[int, list[State]] = {}  # by sequence, then frame
@@ -110,7 +114,7 @@ class MotionState(Transform):
                 f"frame {frame.meta.id} has {len(boxes)} boxes, {len(state)} were labelled.\n"
                 "  fix: motion_state must come before transforms that drop or add boxes"
             )
-        moving = torch.from_numpy(state.copy())
+        moving = torch.from_numpy(rng.permutation(state) if self.shuffle else state.copy())
         if boxes.moving is not None and not self.overwrite:
             moving = torch.where(boxes.moving >= 0, boxes.moving, moving)
         targets: Targets = frame.targets.replace(boxes=boxes.replace(moving=moving))
