@@ -21,7 +21,7 @@ from torch import nn
 from lidarfw.assembly import make_transforms
 from lidarfw.errors import ConfigError
 from lidarfw.model import PerceptionModel
-from lidarfw.ops.bench import street_scan
+from lidarfw.ops.inputs import street_scan
 from lidarfw.predict import FrameReader, find_sources, needed_inputs
 from lidarfw.types import Batch, Frame, FrameMeta, Points, Targets, collate
 
@@ -52,19 +52,11 @@ class Latency:
 
 
 def simulated_frame(model: PerceptionModel) -> Frame:
-    """A scan of `lidarfw.ops.bench.street_scan` in place of the model's data.
+    """A scan of `lidarfw.ops.inputs.street_scan` in place of the model's data.
 
     Raises ConfigError where the model reads more than points.
     """
     spec = model.plan.data
-    others = [
-        f"{n} ({spec.inputs[n].kind.__name__})" for n in needed_inputs(model) if spec.inputs[n].kind is not Points
-    ]
-    if others:
-        raise ConfigError(
-            f"bench simulates points only, and the model also reads {', '.join(others)}\n"
-            "  fix: --scan FILE --image FILE, real ones"
-        )
     scan = street_scan(half_view=math.pi)
     time_ = torch.zeros(len(scan)) if spec.sweeps > 1 else None
     inputs = {
@@ -75,6 +67,14 @@ def simulated_frame(model: PerceptionModel) -> Frame:
     frame = Frame(inputs, Targets(), FrameMeta("street"))
     for transform in make_transforms(model.plan.config, training=False):
         frame = transform(frame, np.random.default_rng(0))
+    missing = [
+        f"{name} ({spec.inputs[name].kind.__name__})" for name in needed_inputs(model) if name not in frame.inputs
+    ]
+    if missing:
+        raise ConfigError(
+            f"bench simulates points only, and the model also reads {', '.join(missing)}\n"
+            "  fix: --scan FILE --image FILE, real ones"
+        )
     return frame
 
 
@@ -85,19 +85,19 @@ def read_frame(model: PerceptionModel, scan: Path, calibration: Path | None, ima
 
 
 @contextlib.contextmanager
-def _clocks(model: PerceptionModel, times: dict[str, list[float]]) -> Iterator[None]:
+def clocks(model: PerceptionModel, times: dict[str, list[float]]) -> Iterator[None]:
     """Within the block every component's forward adds its milliseconds to `times`."""
     started: dict[str, float] = {}
 
     def before(name: str) -> Any:
         def hook(module: nn.Module, args: Any) -> None:
-            started[name] = _now()
+            started[name] = now()
 
         return hook
 
     def after(name: str) -> Any:
         def hook(module: nn.Module, args: Any, output: Any) -> None:
-            times[name].append((_now() - started[name]) * 1e3)
+            times[name].append((now() - started[name]) * 1e3)
 
         return hook
 
@@ -113,7 +113,7 @@ def _clocks(model: PerceptionModel, times: dict[str, list[float]]) -> Iterator[N
             handle.remove()
 
 
-def _now() -> float:
+def now() -> float:
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -131,22 +131,22 @@ def measure(model: PerceptionModel, frame: Frame, batch_size: int = 1, rounds: i
     with torch.no_grad():
         for _ in range(2):
             model.predict(batch)
-        with _clocks(model, times):
+        with clocks(model, times):
             for _ in range(rounds):
-                begin = _now()
+                begin = now()
                 model.predict(batch)
-                totals.append((_now() - begin) * 1e3)
+                totals.append((now() - begin) * 1e3)
     total = statistics.median(totals)
     components = {name: statistics.median(values) for name, values in times.items()}
     components["rest"] = max(total - sum(components.values()), 0.0)
     points = sum(len(value) for value in batch.inputs.values() if isinstance(value, Points))
     parameters = sum(p.numel() for p in model.parameters())
     return Latency(
-        components, total, batch_size, points, parameters, _memory(device), str(device), torch.get_num_threads()
+        components, total, batch_size, points, parameters, memory(device), str(device), torch.get_num_threads()
     )
 
 
-def _memory(device: torch.device) -> float:
+def memory(device: torch.device) -> float:
     """MB at the peak."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated() / 2**20

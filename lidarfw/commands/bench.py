@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from lidarfw.latency import Latency
     from lidarfw.model import PerceptionModel
     from lidarfw.ops.bench import Report
+    from lidarfw.stream_latency import StreamLatency
     from lidarfw.types import Points
 
-RIVALS = ("spconv", "numba", "shapely")
+RIVALS = {"spconv": "spconv", "numba": "numba", "shapely": "shapely", "faiss": "faiss-cpu"}  # package: distribution
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,10 +30,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scan", metavar="FILE", type=Path, help="a real scan; else a simulated street")
     model = parser.add_argument_group("of a model")
     model.add_argument("--batch", metavar="N", type=int, default=1, help="frames in a batch (%(default)s)")
+    model.add_argument("--stream", metavar="N", type=int, help="N frames one by one, from scan to filtered result")
+    model.add_argument("--merge", action="store_true", help="merge the model for inference first (lidarfw.merge)")
+    model.add_argument("--precision", choices=("fp32", "bf16"), default="fp32", help="of --stream (%(default)s)")
     model.add_argument("--calib", metavar="FILE", type=Path, help="KITTI calibration of the scan")
     model.add_argument("--image", metavar="FILE", type=Path, help="picture of the scan")
     ops = parser.add_argument_group("of ops")
     ops.add_argument("--against", choices=RIVALS, action="append", default=[], help="measure an installed rival too")
+    ops.add_argument("--town", action="store_true", help="measure on a scan of the simulated town too (lidarfw-town)")
     ops.add_argument("--only", metavar="TEXT", default="", help="cases whose name contains it")
     ops.add_argument("--picture", metavar="FILE", type=Path, help="PNG of the ratios")
 
@@ -53,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    for option in ("threads", "rounds", "batch"):
+    for option in ("threads", "rounds", "batch", "stream"):
         if getattr(args, option) is not None and getattr(args, option) < 1:
             raise ConfigError(f"--{option} must be at least 1, got {getattr(args, option)}")
     from importlib.util import find_spec
@@ -62,7 +67,7 @@ def _check(args: argparse.Namespace) -> None:
     if missing:
         raise ConfigError(
             f"--against {missing[0]}: {missing[0]} is not installed here\n"
-            f"  fix: pip install {missing[0]}, best in an environment of its own; lidarfw itself does not need it"
+            f"  fix: pip install {RIVALS[missing[0]]}, best in an environment of its own; lidarfw does not need it"
         )
 
 
@@ -70,10 +75,12 @@ def _bench_ops(args: argparse.Namespace) -> dict[str, Any]:
     from rich.console import Console
 
     from lidarfw.ops import bench
+    from lidarfw.ops.inputs import town_scan
 
-    scan = _scan(args.scan) if args.scan else None
+    scans = {args.scan.stem: _scan(args.scan)} if args.scan else {}
+    scans |= {"town": town_scan()} if args.town else {}
     with Console(stderr=True).status("measuring") as status:
-        report = bench.measure(set(args.against), args.rounds, scan, args.only, lambda case: status.update(case))
+        report = bench.measure(set(args.against), args.rounds, scans, args.only, lambda case: status.update(case))
     print(ops_table(report))
     if args.picture and report.timings:
         from lidarfw.files import atomic_path
@@ -110,6 +117,16 @@ def _bench_model(args: argparse.Namespace) -> dict[str, Any]:
     from lidarfw import latency
 
     model = _model(args.what)
+    if args.merge:
+        from lidarfw.merging import merge
+
+        model = merge(model)
+    if args.stream:
+        from lidarfw.stream_latency import measure_stream
+
+        streamed = measure_stream(model, args.stream, args.precision, _scan(args.scan) if args.scan else None)
+        print(stream_table(streamed))
+        return streamed.to_plain()
     if args.scan:
         frame = latency.read_frame(model, args.scan, args.calib, args.image)
     else:
@@ -131,6 +148,21 @@ def _model(what: list[str]) -> PerceptionModel:
     else:
         model = build(plan(compose(what)))
     return model.to("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def stream_table(found: StreamLatency) -> str:
+    """Median and 99th percentile of each part, and the sums."""
+    rows = {**found.parts, "total": found.total}
+    width = max(map(len, rows))
+    lines = [f"{'':<{width}}  {'p50':>8}  {'p99':>8} ms"]
+    lines += [f"{name:<{width}}  {middle:8.1f}  {high:8.1f}" for name, (middle, high) in rows.items()]
+    lines.append(f"{found.frames_per_second:.1f} frames/s over {found.frames} frames of {found.points} points")
+    early, late = found.memory
+    lines.append(
+        f"{found.parameters / 1e6:.2f} M parameters, peak {early:.0f} MB early on and {late:.0f} MB at the end"
+    )
+    lines.append(f"on {found.device}, {found.threads} thread(s), {found.precision}")
+    return "\n".join(lines)
 
 
 def model_table(found: Latency) -> str:

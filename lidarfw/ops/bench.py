@@ -12,10 +12,11 @@ import multiprocessing
 import platform
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 from unittest import mock
 
@@ -24,13 +25,13 @@ from torch import Tensor, nn
 
 from lidarfw import ops
 from lidarfw.ops import naive, rivals, sparse_conv
+from lidarfw.ops.inputs import random_boxes, street_scan
 from lidarfw.ops.rulebook import Kernel, strided_rulebook, submanifold_rulebook
 from lidarfw.types import Grid, Points, RangeView, SceneCoords, Voxels
 
 GRID = Grid((0.0, -40.0, -3.0), (70.4, 40.0, 1.0), (0.05, 0.05, 0.1))  # KITTI, as SECOND has it
 CHANNELS = (16, 32, 64, 64, 128)
 VIEW = RangeView(64, 2048, math.radians(3), math.radians(-25))
-_SENSOR_HEIGHT = 1.73  # metres
 
 Run = Callable[[], Any]
 
@@ -61,75 +62,6 @@ class Report:
     def to_plain(self) -> dict[str, Any]:
         """For a JSON file."""
         return asdict(self)
-
-
-def street_scan(sweeps: int = 1, half_view: float = math.radians(41), seed: int = 0) -> Points:
-    """Points of a simulated 64-beam scanner in a street with facades, cars, poles and bushes.
-
-    Args:
-        sweeps: scans taken a metre apart, all in the frame of the first.
-        half_view: radians kept to either side of straight ahead; pi keeps the whole turn.
-    """
-    random = torch.Generator().manual_seed(seed)
-    boxes, depth = _street(random)
-    scans = [_scan(boxes, depth, torch.tensor([float(k), 0.0, 0.0]), half_view, random) for k in range(sweeps)]
-    xyz = torch.cat(scans)
-    remission = torch.rand(len(xyz), 1, generator=random)
-    return Points.from_scan(xyz, remission)
-
-
-def _street(random: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Axis-aligned boxes (K, 6) lower and upper corner, and how deep a ray gets into each (K,) metres."""
-
-    def row(count: int, low: list[float], high: list[float], size: list[float], vary: list[float]) -> Tensor:
-        center = torch.tensor(low) + torch.rand(count, 3, generator=random) * (torch.tensor(high) - torch.tensor(low))
-        half = (torch.tensor(size) + torch.rand(count, 3, generator=random) * torch.tensor(vary)) / 2
-        base = torch.cat([center[:, :2] - half[:, :2], torch.full((count, 1), -_SENSOR_HEIGHT)], 1)
-        return torch.cat([base, base + 2 * half], 1)
-
-    sides = (-1, 1)
-    facades = [row(12, [-70, side * 16.0, 0], [90, side * 24.0, 0], [9, 6, 5], [8, 3, 7]) for side in sides]
-    cars = [row(12, [-60, side * 4.5, 0], [80, side * 6.0, 0], [3.8, 1.6, 1.4], [1, 0.3, 0.5]) for side in sides]
-    poles = row(20, [-60, -9, 0], [80, 9, 0], [0.15, 0.15, 4], [0.2, 0.2, 3])
-    bushes = [row(20, [-60, side * 8.0, 0], [80, side * 13.0, 0], [1.5, 1.5, 0.8], [4, 3, 2]) for side in sides]
-    crowns = [row(12, [-60, side * 7.0, 0], [80, side * 12.0, 0], [3, 3, 4], [4, 3, 4]) for side in sides]
-    crowns = [c + torch.tensor([0, 0, 2.5, 0, 0, 0]) for c in crowns]
-    solid, soft = torch.cat([*facades, *cars, poles]), torch.cat([*bushes, *crowns])
-    return torch.cat([solid, soft]), torch.cat([torch.zeros(len(solid)), torch.full((len(soft),), 2.5)])
-
-
-def _scan(boxes: Tensor, depth: Tensor, origin: Tensor, half_view: float, random: torch.Generator) -> Tensor:
-    """(N, 3) returns of one turn, in the frame of the street."""
-    elevation = torch.cat([torch.linspace(2, -8.3, 32), torch.linspace(-8.8, -24.8, 32)]).deg2rad()
-    azimuth = torch.arange(2083) / 2083 * 2 * math.pi - math.pi
-    azimuth = azimuth[azimuth.abs() < half_view]
-    flat, angle = elevation.cos()[:, None], azimuth[None]
-    rays = [flat * angle.cos(), flat * angle.sin(), elevation.sin()[:, None] * torch.ones_like(angle)]
-    direction = torch.stack(rays, -1).view(-1, 3)
-    distance = torch.where(direction[:, 2] < 0, -_SENSOR_HEIGHT / direction[:, 2], torch.inf)
-    for box, soft in zip(boxes, depth, strict=True):
-        first, second = (box[:3] - origin) / direction, (box[3:] - origin) / direction
-        near, far = torch.minimum(first, second).amax(1), torch.maximum(first, second).amin(1)
-        inside = near + soft * torch.rand(len(near), generator=random)
-        hit = (near > 0) & (near < far) & (inside < far)
-        distance = torch.where(hit, torch.minimum(distance, inside), distance)
-    distance = distance + torch.randn(len(distance), generator=random) * 0.015
-    rough = (origin + direction * distance[:, None])[:, 1].abs() > 5.5  # grass beside the road
-    distance = distance - rough * torch.rand(len(distance), generator=random) * 0.04 * distance.clamp(max=25)
-    seen = (distance < 100) & (torch.rand(len(distance), generator=random) > 0.08)
-    return direction[seen] * distance[seen, None] + origin
-
-
-def random_boxes(count: int, kind: str, seed: int = 0) -> Tensor:
-    """(count, 7) boxes: `cluster` round 50 objects, `spread` over 70 x 80 m, or `dense`, all over each other."""
-    random = torch.Generator().manual_seed(seed)
-    extent = torch.tensor([70, 80, 2, 3, 1, 1, 2 * math.pi]) if kind != "dense" else torch.tensor([1, 1, 1, 3, 1, 1, 6])
-    objects = 50 if kind == "cluster" else count
-    boxes = torch.rand(objects, 7, generator=random) * extent + torch.tensor([0, -40, -2, 3, 1.5, 1.4, 0])
-    if kind != "cluster":
-        return boxes
-    noise = torch.randn(count, 7, generator=random) * torch.tensor([0.4, 0.4, 0.2, 0.2, 0.1, 0.1, 0.2])
-    return boxes[torch.randint(50, (count,), generator=random)] + noise
 
 
 def interleaved(candidates: dict[str, Run], rounds: int) -> dict[str, list[float]]:
@@ -176,45 +108,48 @@ def forward_times(net: nn.Module, voxels: Voxels, rounds: int) -> list[float]:
         return interleaved({"ours": lambda: net(fresh(voxels))}, rounds)["ours"]
 
 
-def _backbone_cases(name: str, voxels: Voxels, against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
-    torch.manual_seed(0)
-    net = backbone(voxels.features.shape[1]).eval()
-    fused = ops.fuse(net)
-    text = f"{name}, {len(voxels)} voxels"
+def _forward(net: nn.Module, make: Callable[[], Any]) -> Run:
+    @torch.no_grad()
+    def run() -> Any:
+        return net(make())
 
-    def forward() -> Any:
-        with torch.no_grad():
-            return net(fresh(voxels))
+    return run
 
-    def forward_fused() -> Any:
-        with torch.no_grad():
-            return fused(fresh(voxels))
 
-    def forward_naive() -> Any:
-        with torch.no_grad(), mock.patch.object(sparse_conv, "convolve", naive.convolve):
-            return net(fresh(voxels))
-
-    def train() -> None:
+def _train(net: nn.Module, voxels: Voxels, make: Callable[[Tensor], Any]) -> Run:
+    def run() -> None:
         features = voxels.features.clone().requires_grad_()
-        net(fresh(voxels, features)).features.square().mean().backward()
+        net(make(features)).features.square().mean().backward()
 
-    candidates: dict[str, Run] = {"ours": forward, "ours, fused": forward_fused, "naive": forward_naive}
-    train_candidates: dict[str, Run] = {"ours": train}
+    return run
+
+
+def _with_naive_convolution(run: Run) -> None:
+    with mock.patch.object(sparse_conv, "convolve", naive.convolve):
+        run()
+
+
+def _backbone_cases(name: str, scan: Points, against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
+    torch.manual_seed(0)
+    voxels = ops.voxelize_mean(scan, GRID)
+    net = backbone(voxels.features.shape[1]).eval()
+    make = partial(fresh, voxels)
+    ours = _forward(net, make)
+    forward: dict[str, Run] = {
+        "ours": ours,
+        "ours, fused": _forward(ops.fuse(net), make),
+        "naive": partial(_with_naive_convolution, ours),
+    }
+    train: dict[str, Run] = {"ours": _train(net, voxels, make)}
     if "spconv" in against:
-        rival = rivals.spconv_backbone(CHANNELS, voxels.features.shape[1]).eval()
-
-        def forward_spconv() -> Any:
-            with torch.no_grad():
-                return rival(rivals.spconv_tensor(voxels))
-
-        def train_spconv() -> None:
-            features = voxels.features.clone().requires_grad_()
-            with rivals.spconv_backward_on_cpu():
-                rival(rivals.spconv_tensor(voxels, features)).features.square().mean().backward()
-
-        candidates["spconv"], train_candidates["spconv"] = forward_spconv, train_spconv
-    yield f"backbone forward ({text})", candidates
-    yield f"backbone forward + backward ({text})", train_candidates
+        rival, make = (
+            rivals.spconv_backbone(CHANNELS, voxels.features.shape[1]).eval(),
+            partial(rivals.spconv_tensor, voxels),
+        )
+        forward["spconv"] = _forward(rival, make)
+        train["spconv"] = rivals.spconv_backward_on_cpu()(_train(rival, voxels, make))
+    yield f"backbone forward ({name}, {len(voxels)} voxels)", forward
+    yield f"backbone forward + backward ({name}, {len(voxels)} voxels)", train
 
 
 def _layer_cases(voxels: Voxels) -> Iterator[tuple[str, dict[str, Run]]]:
@@ -230,49 +165,48 @@ def _layer_cases(voxels: Voxels) -> Iterator[tuple[str, dict[str, Run]]]:
         yield f"submanifold layer, {channels} channels, {len(voxels)} voxels", runs
 
 
-def _point_cases(scan: Points, against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
-    points = torch.cat([scan.xyz, scan.features], 1)
+def _voxel_case(scan: Points, against: set[str]) -> tuple[str, dict[str, Run]]:
     grid = Grid((-70.4, -40.0, -3.0), (70.4, 40.0, 1.0), (0.1, 0.1, 0.1))
-    voxelize: dict[str, Run] = {
-        "ours": lambda: ops.voxelize_mean(scan, grid),
-        "naive": lambda: naive.voxelize_mean(scan, grid),
+    runs: dict[str, Run] = {
+        "ours": partial(ops.voxelize_mean, scan, grid),
+        "naive": partial(naive.voxelize_mean, scan, grid),
     }
     if "spconv" in against:
-        voxelize["spconv"] = rivals.spconv_voxelizer(grid, points)
-    yield f"voxelise + mean, {len(scan)} points", voxelize
+        runs["spconv"] = rivals.spconv_voxelizer(grid, torch.cat([scan.xyz, scan.features], 1))
+    return f"voxelise + mean, {len(scan)} points", runs
+
+
+def _range_cases(scan: Points) -> Iterator[tuple[str, dict[str, Run]]]:
     xyz, features = scan.xyz.numpy(), scan.features.numpy()
-    yield (
-        f"range projection, {len(scan)} points",
-        {
-            "ours": lambda: ops.range_project(scan, VIEW),
-            "naive": lambda: naive.range_project(xyz, features, VIEW),
-        },
-    )
+    project: dict[str, Run] = {
+        "ours": partial(ops.range_project, scan, VIEW),
+        "naive": partial(naive.range_project, xyz, features, VIEW),
+    }
+    yield f"range projection, {len(scan)} points", project
     image, distance = ops.range_project(scan, VIEW), scan.xyz.norm(dim=1)
     labels = torch.randint(20, image.mask.shape, generator=torch.Generator().manual_seed(0))
-    yield (
-        f"range kNN, {len(scan)} points",
-        {
-            "ours": lambda: ops.range_knn(image, labels, distance),
-            "naive": lambda: naive.range_knn(image, labels, distance),
-        },
-    )
+    vote: dict[str, Run] = {
+        "ours": partial(ops.range_knn, image, labels, distance),
+        "naive": partial(naive.range_knn, image, labels, distance),
+    }
+    yield f"range kNN, {len(scan)} points", vote
+
+
+def _neighbor_cases(scan: Points, against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
     few = scan.xyz[:: max(len(scan) // 8192, 1)][:8192]
     zeros = torch.zeros(len(few), dtype=torch.long)
-    yield (
-        "farthest points, 512 of 8192",
-        {
-            "ours": lambda: ops.farthest_points(few, zeros, 1, 512),
-            "naive": lambda: naive.farthest_points(few, 512),
-        },
-    )
-    yield (
-        "16 nearest of 8192 points",
-        {
-            "ours": lambda: ops.knn(few, zeros, few, zeros, 16),
-            "naive": lambda: torch.cdist(few, few).topk(16, largest=False),
-        },
-    )
+    sample: dict[str, Run] = {
+        "ours": partial(ops.farthest_points, few, zeros, 1, 512),
+        "naive": partial(naive.farthest_points, few, 512),
+    }
+    yield "farthest points, 512 of 8192", sample
+    nearest: dict[str, Run] = {
+        "ours": partial(ops.knn, few, zeros, few, zeros, 16),
+        "naive": partial(naive.nearest, few, few, 16),
+    }
+    if "faiss" in against:
+        nearest["faiss"] = partial(rivals.faiss_nearest, few, few, 16)
+    yield "16 nearest of 8192 points", nearest
 
 
 def _pose_case() -> tuple[str, dict[str, Run]]:
@@ -289,15 +223,14 @@ def _pose_case() -> tuple[str, dict[str, Run]]:
 
 
 def _box_cases(against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
-    compiled = rivals.numba_functions() if "numba" in against else None
     for kind in ("cluster", "spread", "dense"):
         a, b = random_boxes(500, kind), random_boxes(500, kind, 1 if kind != "cluster" else 0)
         runs: dict[str, Run] = {
             "ours": partial(ops.iou_bev, a, b),
             "ours, float64": partial(ops.iou_bev, a.double(), b.double()),
         }
-        if compiled:
-            runs["numba"] = partial(compiled[0], a, b)
+        if "numba" in against:
+            runs["numba"] = partial(rivals.numba_iou, a, b)
         if "shapely" in against:
             runs["shapely"] = partial(rivals.shapely_iou, a, b)
         yield f"rotated IoU 500 x 500, {kind}", runs
@@ -307,23 +240,22 @@ def _box_cases(against: set[str]) -> Iterator[tuple[str, dict[str, Run]]]:
             "ours": partial(ops.nms_rotated, boxes, scores, 0.1),
             "naive": partial(naive.nms, boxes, scores, 0.1),
         }
-        if compiled:
-            runs["numba"] = partial(compiled[1], boxes, scores, 0.1)
+        if "numba" in against:
+            runs["numba"] = partial(rivals.numba_nms, boxes, scores, 0.1)
         yield f"rotated NMS of 1000, {kind}", runs
 
 
-def cases(against: set[str], scan: Points | None = None) -> Iterator[tuple[str, dict[str, Run]]]:
-    """Every case with its candidates. `scan` is a real one, measured beside the simulated."""
-    small = ops.voxelize_mean(street_scan(), GRID)
-    large = ops.voxelize_mean(street_scan(2, math.radians(90)), GRID)
-    yield from _backbone_cases("street", small, against)
-    yield from _backbone_cases("street, 2 sweeps", large, against)
-    if scan is not None:
-        yield from _backbone_cases("given scan", ops.voxelize_mean(scan, GRID), against)
-    yield from _layer_cases(small)
-    yield from _point_cases(street_scan(1, math.pi), against)
-    if scan is not None:
-        yield from _point_cases(scan, against)
+def cases(against: set[str], scans: Mapping[str, Points]) -> Iterator[tuple[str, dict[str, Run]]]:
+    """Every case with its candidates, on the simulated street and on `scans`, by their names."""
+    inputs = {"street": street_scan(), "street, 2 sweeps": street_scan(2, math.radians(90)), **scans}
+    for name, scan in inputs.items():
+        yield from _backbone_cases(name, scan, against)
+    yield from _layer_cases(ops.voxelize_mean(inputs["street"], GRID))
+    turn = street_scan(1, math.pi)
+    for scan in (turn, *scans.values()):
+        yield _voxel_case(scan, against)
+        yield from _range_cases(scan)
+    yield from _neighbor_cases(turn, against)
     yield from _box_cases(against)
     yield _pose_case()
 
@@ -418,18 +350,19 @@ def machine() -> dict[str, Any]:
 def measure(
     against: set[str],
     rounds: int = 7,
-    scan: Points | None = None,
+    scans: Mapping[str, Points] = MappingProxyType({}),
     only: str = "",
     started: Callable[[str], None] = lambda case: None,
 ) -> Report:
     """Run the cases whose name contains `only`.
 
     Args:
-        against: rivals to measure too, of spconv, numba, shapely; they must be installed.
+        against: rivals to measure too, of spconv, numba, shapely, faiss; they must be installed.
+        scans: scans to measure beside the simulated street, by name.
         started: called with the name of each case as it begins.
     """
     report = Report(machine())
-    for name, candidates in cases(against, scan):
+    for name, candidates in cases(against, scans):
         if only in name:
             started(name)
             report.timings.append(Timing(name, interleaved(candidates, rounds)))

@@ -96,6 +96,11 @@ def farthest_points(xyz: Tensor, count: int) -> Tensor:
     return torch.tensor(chosen)
 
 
+def nearest(query: Tensor, reference: Tensor, count: int) -> Tensor:
+    """(Q, count) rows of the nearest reference points, from all distances."""
+    return torch.cdist(query, reference).topk(count, largest=False).indices
+
+
 def best_pose(source: Tensor, world: Tensor, triples: Tensor, threshold: float) -> Tensor:
     """(4, 4) best by MSAC score of the poses fitted to the triples (H, 3), one hypothesis after another."""
     best, lowest = torch.eye(4), torch.inf

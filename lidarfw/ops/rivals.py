@@ -5,22 +5,16 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from typing import Any
 from unittest import mock
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from lidarfw.ops.boxes import box_corners
 from lidarfw.types import Grid, Voxels
 
-Module = Any  # spconv and numba have no types
-
-
-def installed(name: str) -> bool:
-    return find_spec(name) is not None
+Module = Any  # the rivals have no types
 
 
 def spconv_backbone(channels: tuple[int, ...], in_channels: int) -> nn.Module:
@@ -75,82 +69,35 @@ def spconv_voxelizer(grid: Grid, points: Tensor, maximum: int = 5) -> Callable[[
 def shapely_iou(a: Tensor, b: Tensor) -> Tensor:
     """(N, M) exact BEV IoU."""
     shapely = importlib.import_module("shapely")
-    left, right = (shapely.polygons(box_corners(boxes.double())[:, :4, :2].numpy()) for boxes in (a, b))
+    left, right = (shapely.polygons(_corners(boxes)) for boxes in (a, b))
     common = shapely.area(shapely.intersection(left[:, None], right[None]))
     return torch.from_numpy(common / (shapely.area(left)[:, None] + shapely.area(right) - common))
 
 
-def numba_functions() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Compiled BEV IoU (N, M) with circle prefilter, and greedy NMS on it: polygon clipping, one pair at a time."""
-    numba: Module = importlib.import_module("numba")
-    numba.config.THREADING_LAYER = "workqueue"  # its OpenMP layer would change the number of threads of torch
-    compiled: Callable[[Any], Any] = numba.njit
-    parallel: Callable[[Any], Any] = numba.njit(parallel=True)
+def numba_iou(a: Tensor, b: Tensor) -> Tensor:
+    """(N, M) BEV IoU in float64, compiled."""
+    boxes: Module = importlib.import_module("lidarfw.ops.numba_boxes")
+    boxes.set_threads(torch.get_num_threads())
+    return torch.from_numpy(boxes.matrix(_corners(a), _corners(b), a.double().numpy(), b.double().numpy()))
 
-    @compiled
-    def overlap(p: Any, q: Any) -> Any:
-        points = np.empty((24, 2))
-        clipped = np.empty((24, 2))
-        points[:4] = p
-        count = 4
-        for edge in range(4):
-            x0, y0 = q[edge, 0], q[edge, 1]
-            dx, dy = q[(edge + 1) % 4, 0] - x0, q[(edge + 1) % 4, 1] - y0
-            kept = 0
-            for i in range(count):
-                x, y = points[i, 0], points[i, 1]
-                u, v = points[(i + 1) % count, 0], points[(i + 1) % count, 1]
-                here, there = dx * (y - y0) - dy * (x - x0), dx * (v - y0) - dy * (u - x0)
-                if here >= 0:
-                    clipped[kept, 0], clipped[kept, 1] = x, y
-                    kept += 1
-                if here * there < 0:
-                    t = here / (here - there)
-                    clipped[kept, 0], clipped[kept, 1] = x + t * (u - x), y + t * (v - y)
-                    kept += 1
-            count = kept
-            points[:count] = clipped[:count]
-        area = 0.0
-        for i in range(count):
-            j = (i + 1) % count
-            area += points[i, 0] * points[j, 1] - points[j, 0] * points[i, 1]
-        return area / 2
 
-    @compiled
-    def iou(p: Any, q: Any, a: Any, b: Any, i: int, j: int) -> Any:
-        reach = (np.sqrt(a[i, 3] ** 2 + a[i, 4] ** 2) + np.sqrt(b[j, 3] ** 2 + b[j, 4] ** 2)) / 2
-        if (a[i, 0] - b[j, 0]) ** 2 + (a[i, 1] - b[j, 1]) ** 2 >= reach * reach:
-            return 0.0
-        common = overlap(p[i] - b[j, :2], q[j] - b[j, :2])
-        return common / (a[i, 3] * a[i, 4] + b[j, 3] * b[j, 4] - common)
+def numba_nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
+    """Rows that greedy suppression keeps, compiled."""
+    order = torch.argsort(scores, descending=True, stable=True)
+    boxes = boxes[order]
+    keep = importlib.import_module("lidarfw.ops.numba_boxes").nms(_corners(boxes), boxes.double().numpy(), threshold)
+    return order[torch.from_numpy(keep)]
 
-    @parallel
-    def matrix(p: Any, q: Any, a: Any, b: Any) -> Any:
-        result = np.zeros((len(a), len(b)))
-        for i in numba.prange(len(a)):
-            for j in range(len(b)):
-                result[i, j] = iou(p, q, a, b, i, j)
-        return result
 
-    @compiled
-    def nms(p: Any, a: Any, threshold: float) -> Any:
-        dropped = np.zeros(len(a), np.bool_)
-        for i in range(len(a)):
-            for j in range(i + 1, len(a)):
-                if not dropped[i] and not dropped[j] and iou(p, p, a, a, i, j) > threshold:
-                    dropped[j] = True
-        return ~dropped
+def _corners(boxes: Tensor) -> Any:
+    """(N, 4, 2) float64 corners in BEV, as an array."""
+    return box_corners(boxes.double())[:, :4, :2].numpy()
 
-    def corners(boxes: Tensor) -> Any:
-        return box_corners(boxes.double())[:, :4, :2].numpy()
 
-    def run_matrix(a: Tensor, b: Tensor) -> Any:
-        numba.set_num_threads(min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS))
-        return matrix(corners(a), corners(b), a.double().numpy(), b.double().numpy())
-
-    def run_nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
-        order = torch.argsort(scores, descending=True, stable=True)
-        boxes = boxes[order]
-        return order[torch.from_numpy(nms(corners(boxes), boxes.double().numpy(), threshold))]
-
-    return run_matrix, run_nms
+def faiss_nearest(query: Tensor, reference: Tensor, count: int) -> Tensor:
+    """(Q, count) rows of the nearest reference points by faiss, which compares all."""
+    faiss: Module = importlib.import_module("faiss")
+    faiss.omp_set_num_threads(torch.get_num_threads())
+    index = faiss.IndexFlatL2(reference.shape[1])
+    index.add(reference.numpy())
+    return torch.from_numpy(index.search(query.numpy(), count)[1])

@@ -9,7 +9,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from lidarfw import ops
 from lidarfw.cli import main
-from lidarfw.ops import bench, naive, rivals, rulebook, sparse_conv
+from lidarfw.errors import ConfigError
+from lidarfw.ops import bench, inputs, naive, rivals, rulebook, sparse_conv
 from lidarfw.types import SceneCoords
 
 
@@ -46,10 +47,36 @@ def test_naive_versions_give_what_ours_give(scan) -> None:
     labels = torch.randint(20, image.mask.shape, generator=torch.Generator().manual_seed(0))
     distance = scan.xyz.norm(dim=1)
     assert torch.equal(ops.range_knn(image, labels, distance), naive.range_knn(image, labels, distance))
-    few = scan.xyz[:500]
-    assert torch.equal(
-        ops.farthest_points(few, torch.zeros(500, dtype=torch.long), 1, 20)[0], naive.farthest_points(few, 20)
+    few, zeros = scan.xyz[:500], torch.zeros(500, dtype=torch.long)
+    assert torch.equal(ops.farthest_points(few, zeros, 1, 20)[0], naive.farthest_points(few, 20))
+    apart = torch.cdist(few.double(), few.double())
+    found = ops.knn(few, zeros, few, zeros, 5)[0], naive.nearest(few, few, 5)
+    torch.testing.assert_close(*(apart.gather(1, rows) for rows in found), rtol=1e-3, atol=1e-2)
+
+
+def test_the_town_is_an_input_where_it_is_installed(monkeypatch) -> None:
+    pytest.importorskip("lidarfw_town")
+    scan = inputs.town_scan()
+    assert 15_000 <= len(ops.voxelize_mean(scan, bench.GRID)) <= 25_000
+    monkeypatch.setattr(inputs, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="pip install lidarfw-town"):
+        inputs.town_scan()
+
+
+def test_faiss_finds_what_ours_finds(scan) -> None:
+    pytest.importorskip("faiss")
+    few, zeros = scan.xyz[::40], torch.zeros(len(scan.xyz[::40]), dtype=torch.long)
+    assert torch.equal(rivals.faiss_nearest(few, few, 4), ops.knn(few, zeros, few, zeros, 4)[0])
+
+
+@pytest.mark.parametrize("kind", ["cluster", "spread", "dense"])
+def test_numba_gives_the_same_overlaps_and_keeps_the_same_boxes(kind: str) -> None:
+    pytest.importorskip("numba")
+    boxes, scores = bench.random_boxes(300, kind), torch.rand(300, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(
+        rivals.numba_iou(boxes, boxes), ops.iou_bev(boxes.double(), boxes.double()), rtol=0, atol=1e-6
     )
+    assert torch.equal(rivals.numba_nms(boxes, scores, 0.1), ops.nms_rotated(boxes, scores, 0.1))
 
 
 @pytest.mark.parametrize("kind", ["cluster", "spread", "dense"])
@@ -97,11 +124,14 @@ def test_bench_ops_prints_and_writes_what_it_measured(tmp_path, capsys) -> None:
     [
         (["ops", "--rounds", "0"], "--rounds must be at least 1"),
         (["ops", "--against", "numba"], "pip install numba"),
+        (["ops", "--against", "faiss"], "pip install faiss-cpu"),
+        (["ops", "--town"], "pip install lidarfw-town"),
         (["ops", "--scan", "nowhere.bin"], "no such file"),
     ],
 )
 def test_mistakes_are_named(arguments: list[str], message: str, monkeypatch, capsys) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr(inputs, "find_spec", lambda name: None)
     assert main(["bench", *arguments]) == 2
     assert message in capsys.readouterr().err
 
