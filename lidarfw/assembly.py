@@ -123,6 +123,12 @@ def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:
     return dataset
 
 
+def transform_names(config: Mapping[str, Any] | DictConfig, training: bool) -> list[str]:
+    """Names of the transforms that `make_transforms` gives, in order."""
+    nodes = _nodes(_plain(config), "transform", [])
+    return [name for name, node in nodes if training or not registry.load("transform", node["type"]).train_only]
+
+
 def make_transforms(config: Mapping[str, Any] | DictConfig, training: bool) -> list[Transform]:
     """The transforms of a config in order; without augmentations unless `training`."""
     plain = _plain(config)
