@@ -102,7 +102,7 @@ class SceneCoordHead(Head):
         super().__init__()
         self.regressor = CoordinateRegressor(voxels.channels, hidden, tap_channels, target)
         self.tap = Spec(BEV, tap_channels, voxels.stride, voxels.geometry)
-        self.provides = Spec(SceneCoords)
+        self.provides = Spec(SceneCoords, stride=voxels.stride, geometry=voxels.geometry)
 
     def forward(self, voxels: Voxels, points: Points, targets: Targets | None = None) -> SceneCoordOutput:
         """One pair per voxel that holds a point."""
@@ -137,7 +137,7 @@ class SceneCoordBEVHead(Head):
         super().__init__()
         self.regressor = CoordinateRegressor(bev.channels, hidden, tap_channels, target)
         self.tap = Spec(BEV, tap_channels, bev.stride, bev.geometry)
-        self.provides = Spec(SceneCoords)
+        self.provides = Spec(SceneCoords, stride=bev.stride, geometry=bev.geometry)
 
     def forward(self, bev: BEV, points: Points, targets: Targets | None = None) -> SceneCoordOutput:
         """One pair per column that holds a point."""

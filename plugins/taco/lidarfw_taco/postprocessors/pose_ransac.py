@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from lidarfw.interfaces import PostProcessor
 from lidarfw.ops import ransac_pose
-from lidarfw.types import Points, Poses, SceneCoords, Spec
+from lidarfw.types import Grid, Points, Poses, SceneCoords, Spec
 
 from lidarfw_taco.refinement import MapRefiner
 
@@ -13,9 +13,10 @@ from lidarfw_taco.refinement import MapRefiner
 class PoseRansac(PostProcessor):
     """The pose that the most pairs of sensor and map coordinates agree on (TACO, section 4: RANSAC).
 
-    `lidarfw.ops.ransac_pose` with values for scene coordinates on a lattice of 1.6 m: a pair is right within
-    `threshold` metres, about three quarters of the pitch, and the sides of a triple are longer than `shortest_edge`.
-    `confidence` is the share of right pairs; with fewer than `minimum_inliers` of them, or 1 %, `ok` is False.
+    `lidarfw.ops.ransac_pose` with values for scene coordinates: a pair is right within `threshold` metres, by default
+    three quarters of the pitch of the voxels (1.2 m for LiSA's 1.6 m, and where the pitch is not known), and the sides
+    of a triple are longer than `shortest_edge`. `confidence` is the share of right pairs; with fewer than
+    `minimum_inliers` of them, or 1 %, `ok` is False.
 
     With a `map`, a file of points in map coordinates, the scan is then registered to it (beyond the paper): both
     thinned to `map_cell` metres, points matched within `map_distance` metres. That needs `lidarfw-taco[refine]`.
@@ -26,7 +27,7 @@ class PoseRansac(PostProcessor):
         scene_coords: Spec,
         points: Spec,
         *,
-        threshold: float = 1.2,
+        threshold: float | None = None,
         hypotheses: int = 512,
         shortest_edge: float = 2.0,
         minimum_inliers: int = 6,
@@ -35,7 +36,8 @@ class PoseRansac(PostProcessor):
         map_distance: float = 2.0,
     ) -> None:
         super().__init__()
-        self.threshold, self.hypotheses = threshold, hypotheses
+        self.threshold = _usual(scene_coords) if threshold is None else threshold
+        self.hypotheses = hypotheses
         self.shortest_edge, self.minimum_inliers = shortest_edge, minimum_inliers
         self.refiner = MapRefiner(map, map_cell, map_distance) if map else None
         self.provides = Spec(Poses)
@@ -59,3 +61,10 @@ class PoseRansac(PostProcessor):
             refined = refiner.refine(matrix[number].cpu().double().numpy(), scan)
             matrix[number] = torch.from_numpy(refined).to(matrix)
         return poses.replace(matrix=matrix)
+
+
+def _usual(scene_coords: Spec) -> float:
+    """Three quarters of the pitch of the cells that the pairs come from, metres."""
+    if not isinstance(scene_coords.geometry, Grid):
+        return 1.2
+    return 0.75 * scene_coords.geometry.cell[0] * scene_coords.stride
