@@ -104,6 +104,7 @@ def text(stated: ClaimsFile, entries: Sequence[Mapping[str, Any]], command: str)
     counts = [f"{sum(e['outcome']['verdict'] == verdict for e in done)} {verdict}" for verdict in MEANING]
     missing = len(entries) - len(done)
     parts = [
+        "---\norphan: true\n---\n",  # for Sphinx: a page of no table of contents
         f"# Claims: {stated.name}\n",
         f"{stated.paper}\n" if stated.paper else "",
         f"{', '.join(counts)}{f', {missing} not run' if missing else ''}.\n",
