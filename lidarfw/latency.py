@@ -114,9 +114,16 @@ def clocks(model: PerceptionModel, times: dict[str, list[float]]) -> Iterator[No
 
 
 def now() -> float:
+    """Seconds: of the processor at one thread, which other programs do not disturb, else of the clock on the wall."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
-    return time.perf_counter()
+        return time.perf_counter()
+    return time.process_time() if torch.get_num_threads() == 1 else time.perf_counter()
+
+
+def clock_name() -> str:
+    """What `now` counts."""
+    return "processor time" if torch.get_num_threads() == 1 and not torch.cuda.is_available() else "wall time"
 
 
 def measure(model: PerceptionModel, frame: Frame, batch_size: int = 1, rounds: int = 10) -> Latency:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lidarfw.errors import ConfigError
+from lidarfw.files import require_checkpoint
 
 if TYPE_CHECKING:
     from lidarfw.latency import Latency
@@ -44,9 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print a table."""
+    _check(args)
     import torch
 
-    _check(args)
     if args.threads:
         torch.set_num_threads(args.threads)
     found = _bench_ops(args) if args.what == ["ops"] else _bench_model(args)
@@ -58,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
+    if _is_checkpoint(args.what):
+        require_checkpoint(args.what[0])
     for option in ("threads", "rounds", "batch", "stream"):
         if getattr(args, option) is not None and getattr(args, option) < 1:
             raise ConfigError(f"--{option} must be at least 1, got {getattr(args, option)}")
@@ -136,6 +139,10 @@ def _bench_model(args: argparse.Namespace) -> dict[str, Any]:
     return found.to_plain()
 
 
+def _is_checkpoint(what: list[str]) -> bool:
+    return len(what) == 1 and what[0].endswith((".ckpt", ".safetensors"))
+
+
 def _model(what: list[str]) -> PerceptionModel:
     import torch
 
@@ -143,7 +150,7 @@ def _model(what: list[str]) -> PerceptionModel:
     from lidarfw.assembly import build, plan
     from lidarfw.config import compose
 
-    if len(what) == 1 and what[0].endswith((".ckpt", ".safetensors")):
+    if _is_checkpoint(what):
         model = lidarfw.load(Path(what[0]))
     else:
         model = build(plan(compose(what)))
@@ -152,16 +159,16 @@ def _model(what: list[str]) -> PerceptionModel:
 
 def stream_table(found: StreamLatency) -> str:
     """Median and 99th percentile of each part, and the sums."""
+    from lidarfw.latency import clock_name
+
     rows = {**found.parts, "total": found.total}
     width = max(map(len, rows))
     lines = [f"{'':<{width}}  {'p50':>8}  {'p99':>8} ms"]
     lines += [f"{name:<{width}}  {middle:8.1f}  {high:8.1f}" for name, (middle, high) in rows.items()]
     lines.append(f"{found.frames_per_second:.1f} frames/s over {found.frames} frames of {found.points} points")
     early, late = found.memory
-    lines.append(
-        f"{found.parameters / 1e6:.2f} M parameters, peak {early:.0f} MB early on and {late:.0f} MB at the end"
-    )
-    lines.append(f"on {found.device}, {found.threads} thread(s), {found.precision}")
+    lines.append(f"{found.parameters / 1e6:.2f} M parameters, peak {early:.0f} MB early, {late:.0f} MB at the end")
+    lines.append(f"on {found.device}, {found.threads} thread(s), {found.precision}; {clock_name()}")
     return "\n".join(lines)
 
 
