@@ -148,14 +148,17 @@ class Confidence:
     special: dict[str, Network]  # by class name in lower case
 
     @classmethod
-    def load(cls, path: str = "") -> Confidence:
-        """Read the weights that this distribution ships, or those at `path`. DataError where they are broken."""
+    def load(cls, path: str = "", special: bool = True) -> Confidence:
+        """Read the weights that this distribution ships, or those at `path`; DataError where they are broken.
+
+        Without `special` all classes have the general network.
+        """
         text = read_text(path) if path else (files("lidarfw_time3d") / "weights.json").read_text(encoding="utf-8")
         try:
             plain = json.loads(text)
-            special = {name: _network(node) for name, node in plain["special"].items()}
-            return cls(_network(plain["general"]), special)
-        except (KeyError, TypeError, ValueError) as error:
+            networks = {name: _network(node) for name, node in plain["special"].items()}
+            return cls(_network(plain["general"]), networks if special else {})
+        except (KeyError, IndexError, TypeError, ValueError) as error:
             raise DataError(
                 f"{path or 'weights.json'}: is no file of `python -m lidarfw_time3d.fit`: {error!r}"
             ) from error

@@ -239,7 +239,8 @@ def make_tracker(
 
     preset = to_plain(compose(["tracker=kalman_confidence_pointrcnn"]))["tracker"]["kalman_confidence"]
     gate = {name: value for name, value in preset["gate"].items() if name in classes}
-    chosen = {"gate": gate, "calibration": calibration, "field_of_view": view, **options}
+    given = {name: value for name, value in preset.items() if name not in ("type", "inputs")}
+    chosen = {**given, "gate": gate, "calibration": calibration, "field_of_view": view, **options}
     return KalmanConfidence(Spec(Boxes, classes=tuple(classes)), **chosen)
 
 

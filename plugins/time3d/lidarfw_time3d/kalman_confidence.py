@@ -17,6 +17,7 @@ from lidarfw_time3d.kalman import Array, Int, Motion, Noise
 
 NOISE = Noise(measured=0.1, place=0.02, shape=0.01, velocity=0.2, first=0.1, first_velocity=100.0)
 _RIVAL = FEATURES.index("rival_same")
+_HOPELESS = 0.005  # chance at which an unseen track ends
 _REST = 0.7  # m/s below which an unseen object is taken to stand still
 _NEWBORN = 1.5  # times the gate for a track whose velocity is not known yet
 _GROWTH = 0.12  # of the gate per unseen frame
@@ -53,6 +54,8 @@ class KalmanConfidence(Tracker):
     one of its class is.
 
     Scores of the detector are probabilities, or are made log-odds by `calibration`, scale and offset by class name.
+    `place_features` lets classes that have a network of their own (cars) also look at distance, direction, size and
+    at what stands before them: right for KITTI's camera view and what is labelled there, wrong elsewhere.
     `weights` names a file of `python -m lidarfw_time3d.fit`; empty: those that were learned on KITTI's boxes.
     Without a `pose` input the motion of the sensor stays in the tracks: gates should be wider then, and fast turns
     lose tracks. Raises ConfigError for classes that the data does not have, DataError for scores that are no
@@ -70,6 +73,7 @@ class KalmanConfidence(Tracker):
         max_age: int = 20,
         field_of_view: float = 6.2832,
         calibration: dict[str, list[float]] | None = None,
+        place_features: bool = False,
         weights: str = "",
         frame_time: float = 0.1,
     ) -> None:
@@ -81,7 +85,7 @@ class KalmanConfidence(Tracker):
             self.calibration = np.array([calibration.get(name, (1.0, 0.0)) for name in boxes.classes])
         self.min_seen, self.min_unseen, self.max_age = min_seen, min_unseen, max_age
         self.field_of_view, self.frame_time = field_of_view, frame_time
-        self.confidence = Confidence.load(weights)
+        self.confidence = Confidence.load(weights, place_features)
         self.classes = boxes.classes
         self.provides = Spec(Tracks, classes=boxes.classes)
 
@@ -106,8 +110,9 @@ class KalmanConfidence(Tracker):
         chance = self.confidence.probability(values, state.label, self.classes)
         # an unseen track with a better one of its class at its place is a second track of the same object
         double = (state.evidence.missed > 0) & (values[:, _RIVAL] > state.evidence.last - 2)
-        tracks = self._tracks(state, box, np.where(double, 0, chance), boxes)
-        self._end(state, np.where(double, -1, chance))
+        chance[double] = 0
+        tracks = self._tracks(state, box, chance, boxes)
+        self._end(state, chance)
         return [replace(frame, tracks=tracks)]
 
     def advance(self, state: KalmanConfidenceState, found: Array, label: Int, score: Array, passed: float) -> None:
@@ -158,6 +163,6 @@ class KalmanConfidence(Tracker):
 
     def _end(self, state: KalmanConfidenceState, chance: Array) -> None:
         missed = state.evidence.missed
-        alive = (missed == 0) | ((missed < self.max_age) & (chance >= self.min_unseen / 10))
+        alive = (missed == 0) | ((missed < self.max_age) & (chance >= _HOPELESS))
         state.motion, state.evidence = state.motion.take(alive), state.evidence.take(alive)
         state.label, state.id = state.label[alive], state.id[alive]
