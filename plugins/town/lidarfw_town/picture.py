@@ -67,7 +67,7 @@ def _busiest(drive: Drive) -> int:
     parked = np.array([thing.pose[:2] for thing in drive.traffic.parked])
     counts = []
     for step, (x, y) in zip(steps, drive.traffic.ego[steps, :2]):
-        there = np.concatenate([parked, [mover.at(step)[:2] for mover in drive.traffic.movers]])
+        there = np.concatenate([parked, [mover.at(float(step))[:2] for mover in drive.traffic.movers]])
         counts.append((np.hypot(*(there - (x, y)).T) < 30).sum())
     return int(steps[np.argmax(counts)])
 
