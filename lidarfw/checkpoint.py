@@ -22,7 +22,7 @@ from lightning.pytorch.plugins import TorchCheckpointIO
 from torch import Tensor, nn
 
 from lidarfw.errors import AssemblyError, CheckpointError, ConfigError, DataError, RegistryError
-from lidarfw.files import atomic_path
+from lidarfw.files import atomic_path, require_checkpoint
 from lidarfw.types import DataSpec
 
 if TYPE_CHECKING:
@@ -102,11 +102,7 @@ def config_of(about: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
 def verify(path: str | Path) -> None:
     """CheckpointError unless the file is there, whole, and every checksum in it fits; names the last good file."""
     path = Path(path)
-    if "://" in str(path) or str(path).startswith(("http:", "https:", "s3:")):
-        raise CheckpointError(f"{path} is an address.\n  fix: download it first, and give the file")
-    if not path.exists():
-        there = ", ".join(sorted(p.name for p in path.parent.glob("*.ckpt"))) if path.parent.is_dir() else ""
-        raise CheckpointError(f"there is no checkpoint {path}" + (f"\n  in that folder: {there}" if there else ""))
+    require_checkpoint(path)
     reason = _damage(path)
     if reason:
         other = _newest_good(path)

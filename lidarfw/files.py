@@ -1,4 +1,4 @@
-"""Writing files so that a half-written one never stands under its final name."""
+"""Files: none half-written under its final name, and a clear message where a checkpoint is not there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidarfw.errors import DataError
+from lidarfw.errors import CheckpointError, DataError
 
 
 @contextmanager
@@ -37,3 +37,13 @@ def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8, atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def require_checkpoint(path: str | Path) -> None:
+    """CheckpointError unless something lies at `path`. Commands ask before they import torch, which takes seconds."""
+    path = Path(path)
+    if "://" in str(path) or str(path).startswith(("http:", "https:", "s3:")):
+        raise CheckpointError(f"{path} is an address.\n  fix: download it first, and give the file")
+    if not path.exists():
+        there = ", ".join(sorted(p.name for p in path.parent.glob("*.ckpt"))) if path.parent.is_dir() else ""
+        raise CheckpointError(f"there is no checkpoint {path}" + (f"\n  in that folder: {there}" if there else ""))

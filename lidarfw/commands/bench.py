@@ -150,10 +150,7 @@ def _model(what: list[str]) -> PerceptionModel:
     from lidarfw.assembly import build, plan
     from lidarfw.config import compose
 
-    if _is_checkpoint(what):
-        model = lidarfw.load(Path(what[0]))
-    else:
-        model = build(plan(compose(what)))
+    model = lidarfw.load(Path(what[0])) if _is_checkpoint(what) else build(plan(compose(what)))
     return model.to("cuda" if torch.cuda.is_available() else "cpu")
 
 

@@ -7,6 +7,9 @@ import json
 import math
 from pathlib import Path
 
+from lidarfw.errors import ConfigError
+from lidarfw.files import require_checkpoint, write_text
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of `lidarfw eval`."""
@@ -29,14 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate and print a table."""
-    from lidarfw.errors import ConfigError
-    from lidarfw.files import write_text
-    from lidarfw.resampling import FrameRecord
-    from lidarfw.training import evaluate
-
     for option in ("resamples", "block"):
         if getattr(args, option) < 1:
             raise ConfigError(f"--{option} must be at least 1, got {getattr(args, option)}")
+    require_checkpoint(args.checkpoint)
+    from lidarfw.resampling import FrameRecord
+    from lidarfw.training import evaluate
+
     record = FrameRecord() if args.frames else None
     figures = evaluate(Path(args.checkpoint), args.overrides, record)
     detail = record.to_plain(args.resamples, args.block) if record else {}

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from lidarfw.files import require_checkpoint
+
 if TYPE_CHECKING:
     from lidarfw.model import PerceptionModel
     from lidarfw.predict import FrameReader
@@ -49,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Predict every scan, or a whole sequence."""
+    require_checkpoint(args.checkpoint)
     from lidarfw.drive_prediction import is_sequence
 
     if len(args.scans) == 1 and is_sequence(Path(args.scans[0])):

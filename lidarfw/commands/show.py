@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidarfw.files import require_checkpoint
+
 if TYPE_CHECKING:
     from lidarfw.assembly import Plan, Step
     from lidarfw.model import PerceptionModel
@@ -23,6 +25,7 @@ def run(args: argparse.Namespace) -> int:
     from lidarfw.assembly import build, plan
 
     if len(args.overrides) == 1 and args.overrides[0].endswith(".ckpt"):
+        require_checkpoint(args.overrides[0])
         import lidarfw
 
         model = lidarfw.load(Path(args.overrides[0]))

@@ -34,6 +34,11 @@ def test_a_missing_input_names_what_is_there_and_a_neck(site):
     assert "fix: add one of: neck=height_compression" in text
 
 
+@pytest.mark.parametrize("command", [("predict",), ("eval",), ("show",), ("bench",)])
+def test_a_checkpoint_that_is_not_there(site, command):
+    assert "there is no checkpoint nowhere.ckpt" in refused(site, *command, "nowhere.ckpt")
+
+
 def test_two_candidates_must_be_chosen_between(toys):
     necks = ["neck=[widen]", "+neck.other.type=widen", "+neck.other.inputs.bev=backbone.toy_pillars"]
     text = refused(toys, "train", "backbone=toy_pillars", *necks, "head=peak")

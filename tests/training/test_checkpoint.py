@@ -178,15 +178,15 @@ def test_newer_format(file):
 
 def test_missing_plugin(file):
     def change(content):
-        content["lidarfw"]["distributions"]["lidarfw-msrm"] = "0.1.0"
-        content["lidarfw"]["components"]["head.msrm"] = "lidarfw-msrm"
+        content["lidarfw"]["distributions"]["lidarfw-absent"] = "0.1.0"
+        content["lidarfw"]["components"]["head.absent"] = "lidarfw-absent"
 
     rewrite(file, change)
     with pytest.raises(CheckpointError) as error:
         lidarfw.load(file)
     assert str(error.value).startswith(
-        "this checkpoint uses head 'msrm' from lidarfw-msrm 0.1.0, which is not installed. "
-        "Fix: pip install lidarfw-msrm"
+        "this checkpoint uses head 'absent' from lidarfw-absent 0.1.0, which is not installed. "
+        "Fix: pip install lidarfw-absent"
     )
 
 

@@ -68,7 +68,11 @@ def test_a_figure_that_should_be_small(run, tmp_path):
         "callbacks.checkpoints.monitor=loss/total",
         "callbacks.checkpoints.mode=min",
     )
-    assert torch.load(tmp_path / "checkpoints/best.ckpt", weights_only=True)["global_step"] >= 48
+    losses = {row["step"]: row["loss/total"] for row in rows(tmp_path) if "loss/total" in row}
+    at_validation = {row["step"]: losses[row["step"]] for row in rows(tmp_path) if "val/toy/accuracy" in row}
+    best = torch.load(tmp_path / "checkpoints/best.ckpt", weights_only=True)
+    assert len(at_validation) == 5
+    assert best["global_step"] == min(at_validation, key=at_validation.get) + 1
 
 
 def test_filters_that_hold_frames_back_lose_none(run, tmp_path):
