@@ -8,7 +8,7 @@ export PYTHONUNBUFFERED := 1
 
 .PHONY: help install test lint docs demo clean
 help:
-	@echo "make demo     train, evaluate and predict on made-up scans; writes runs/demo/report.html"
+	@echo "make demo     train, evaluate and predict on a simulated town; writes runs/demo/report.html"
 	@echo "make test     the test suite"
 	@echo "make lint     ruff and mypy"
 	@echo "make docs     the documentation as HTML, in docs/_build/html"

@@ -53,6 +53,7 @@ def write_report(
     frames: int = 4,
     score: float = 0.3,
     seconds: Mapping[str, float] | None = None,
+    pictures: Mapping[str, str | Path] | None = None,
 ) -> Path:
     """Write RUN/report.html and give its path.
 
@@ -63,6 +64,7 @@ def write_report(
         frames: how many of them, evenly spaced over the split.
         score: boxes below are not drawn.
         seconds: wall time by stage, shown where given.
+        pictures: PNG files by caption, shown after the predictions.
     """
     folder = Path(run_dir)
     path = _checkpoint(folder)
@@ -78,6 +80,7 @@ def write_report(
             "Curves", _image(draw.curves(curves), "running means; faint lines are single steps") if curves else ""
         ),
         _section(f"Predictions beside the truth, split {split}", _frames(model, split, frames, score)),
+        _section("Data", "".join(_png(Path(file).read_bytes(), text) for text, file in (pictures or {}).items())),
         _section("Figures", _figures(figures)),
         _section("Wiring", _wiring(model)),
         _section("Time", _table(["stage", "seconds"], [(k, f"{v:.1f}") for k, v in (seconds or {}).items()])),
@@ -125,8 +128,11 @@ def _cell(text: str) -> str:
 
 
 def _image(picture: draw.Picture, caption: str) -> str:
-    data = base64.b64encode(draw.png_bytes(picture)).decode()
-    text = html.escape(caption)
+    return _png(draw.png_bytes(picture), caption)
+
+
+def _png(content: bytes, caption: str) -> str:
+    data, text = base64.b64encode(content).decode(), html.escape(caption)
     picture_tag = f'<img alt="{text}" src="data:image/png;base64,{data}">'
     return f"<figure><label><input type=checkbox hidden>{picture_tag}</label><figcaption>{text}</figcaption></figure>"
 

@@ -18,6 +18,7 @@ from lidarfw.checkpoint import describe
 from lidarfw.cli import main
 from lidarfw.commands.eval import table
 from lidarfw.config import compose
+from lidarfw.draw import png_bytes
 from lidarfw.errors import DataError
 from lidarfw.report import write_report
 
@@ -49,14 +50,25 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_report_holds_everything_and_loads_nothing(run: Path) -> None:
-    path = write_report(run, frames=2, score=0.0, seconds={"train": 61.25})
+    picture = run / "town.png"
+    picture.write_bytes(png_bytes(np.full((8, 8, 3), 200, np.uint8)))
+    path = write_report(run, frames=2, score=0.0, seconds={"train": 61.25}, pictures={"the <town>": picture})
     text = path.read_text()
     assert path == run / "report.html"
-    for word in ("first &lt;run&gt;", "backbone.pillars", "loss.center", "0.2500", "61.2", "torch", "frames: 5"):
+    for word in (
+        "first &lt;run&gt;",
+        "backbone.pillars",
+        "loss.center",
+        "0.2500",
+        "61.2",
+        "torch",
+        "frames: 5",
+        "the &lt;town&gt;",
+    ):
         assert word in text, word
     assert "<run>" not in text
     pictures = [base64.b64decode(data) for data in re.findall(r'src="data:image/png;base64,([^"]+)"', text)]
-    assert len(pictures) == 3  # curves, two frames
+    assert len(pictures) == 4  # curves, two frames, the one given
     assert all(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR) is not None for picture in pictures)
     assert not re.findall(r'(?:src|href)="(?!data:)', text)
     assert "http" not in text
