@@ -25,9 +25,10 @@ class TaskFeatures(Metric):
 
     `cross_task_cosine`: mean cosine of the `top` longest localization vectors outside of all objects with the object
     vectors on the detection map, averaged over the frames that have objects; what ITCL lowers.
+    `parked_cosine`: the same with the vectors of static objects on the localization map; what ILCL lowers.
     `parked_share`: of the `top` longest localization vectors, objects included, the share that lies in the footprint
-    of a static object; what ILCL lowers. `parked_area`: the share of those footprints in the cells that are not empty,
-    which `parked_share` is by chance.
+    of a static object, and `parked_area`: the share of those footprints in the cells that are not empty, which
+    `parked_share` is by chance. ILCL sees directions only, so it changes them by way of the task, if at all.
     `neighbor_accuracy`: how often the object of the opposite motion state that is most alike on the detection map, by
     cosine and in the same frame, is of the same class; of objects that have both right and wrong ones to choose from;
     what IDCL raises. Objects of unknown motion state play no part.
@@ -37,7 +38,7 @@ class TaskFeatures(Metric):
 
     monitor: ClassVar[str] = "neighbor_accuracy"
     higher_is_better = True
-    sums: Tensor  # (8,) float64: cosine, frames, parked, chosen, parked cells, cells, right, of how many
+    sums: Tensor  # (10,) float64: two cosines, each with its frames; parked, chosen, parked cells, cells; right, of all
 
     def __init__(self, detection: Spec, localization: Spec, *, top: int = 128) -> None:
         super().__init__()
@@ -45,7 +46,7 @@ class TaskFeatures(Metric):
         if top <= 0:
             raise ConfigError(f"metric.task_features.top must be above 0, got {top}")
         self.top = top
-        self.add_state("sums", default=torch.zeros(8, dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("sums", default=torch.zeros(10, dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(
         self,
@@ -58,16 +59,15 @@ class TaskFeatures(Metric):
             return
         boxes = targets.boxes
         objects, rows = object_features(detection, boxes)
-        cosine = self._cosine(localization, objects, boxes, boxes.batch[rows])
         moving = torch.full_like(boxes.label, -1) if boxes.moving is None else boxes.moving
-        parked = self._parked(localization, boxes[moving == 0])
+        static = boxes[moving == 0]
+        cells = top_cells(localization, self.top, occupied(localization, boxes))[:2]
+        across = _cosine(*cells, objects, boxes.batch[rows])
+        pseudo, parts = object_features(localization, static)
+        within = _cosine(*cells, pseudo, static.batch[parts])
+        parked = self._parked(localization, static)
         right = neighbors(objects, boxes.label[rows], moving[rows], boxes.batch[rows])
-        self.sums += torch.stack([*cosine, *parked, *right]).to(self.sums)
-
-    def _cosine(self, localization: BEV, objects: Tensor, boxes: Boxes, batch: Tensor) -> tuple[Tensor, Tensor]:
-        cells, valid, _ = top_cells(localization, self.top, occupied(localization, boxes))
-        counted = (batch.bincount(minlength=len(cells)) > 0) & valid.any(1)
-        return mean_similarity(cells, valid, objects, batch)[counted].sum(), counted.sum()
+        self.sums += torch.stack([*across, *within, *parked, *right]).to(self.sums)
 
     def _parked(self, localization: BEV, static: Boxes) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         _, valid, index = top_cells(localization, self.top)
@@ -77,14 +77,21 @@ class TaskFeatures(Metric):
 
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""
-        cosine, frames, parked, chosen, parked_cells, cells, right, queries = self.sums.tolist()
+        across, frames, within, static_frames, parked, chosen, parked_cells, cells, right, queries = self.sums.tolist()
         return {
-            "cross_task_cosine": cosine / max(frames, 1),
+            "cross_task_cosine": across / max(frames, 1),
+            "parked_cosine": within / max(static_frames, 1),
             "parked_share": parked / max(chosen, 1),
             "parked_area": parked_cells / max(cells, 1),
             "neighbor_accuracy": right / max(queries, 1),
             "frames": frames,
         }
+
+
+def _cosine(cells: Tensor, valid: Tensor, objects: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum over the samples that have cells and objects of their mean cosine, and how many these are."""
+    counted = (batch.bincount(minlength=len(cells)) > 0) & valid.any(1)
+    return mean_similarity(cells, valid, objects, batch)[counted].sum(), counted.sum()
 
 
 def neighbors(vectors: Tensor, label: Tensor, moving: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
