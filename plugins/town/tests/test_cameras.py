@@ -7,7 +7,7 @@ import pytest
 import torch
 from lidarfw.types import Camera
 
-from lidarfw_town import light, render
+from lidarfw_town import light, render, speed
 from lidarfw_town.beams import Body
 from lidarfw_town.camera import fisheye_cameras, kitti_camera, kitti_projection, perspective_cameras, rays_of
 from lidarfw_town.drive import Drive, TownFrame
@@ -291,3 +291,10 @@ def test_meshes_keep_their_glow() -> None:
     both: Mesh = join([lamp, box((3, 0, 0), (1, 1, 1), Surface(80, 0.3, (1, 1, 1)))]).placed(1, 2, 3, 0.5)
     assert both.glow.tolist() == [2.0] * 12 + [0.0] * 12
     assert not both.without_glow().glow.any()
+
+
+def test_the_parts_of_a_frame_are_timed(drive: Drive, capsys: pytest.CaptureFixture[str]) -> None:
+    speed._frames(drive, 2)
+    whole, *parts = (row.split("|")[2] for row in capsys.readouterr().out.splitlines())
+    assert 0 < float(whole) < 30
+    assert 50 < sum(int(part.strip().rstrip("%")) for part in parts) <= 103
