@@ -88,6 +88,14 @@ def test_past_scans_stand_in_the_current_frame(root):
     assert points.time.unique().tolist() == pytest.approx([-0.1, -0.05, 0], abs=1e-5)
 
 
+def test_boxes_with_track_ids_are_tracks(root):
+    data = dataset(root, boxes=True)
+    assert data[0].targets.tracks is None
+    labels = next(root.glob(f"**/boxes/{STAMPS[1]}.txt"))
+    labels.write_text("Vehicle 10 2 -1 4 1.8 1.5 0.1 7\nTram 1 2 3 9 3 3 0 8\n")
+    assert dataset(root, boxes=True)[0].targets.tracks.id.tolist() == [7]
+
+
 def test_boxes(root):
     data = dataset(root, boxes=True)
     boxes = data[0].targets.boxes

@@ -27,7 +27,7 @@ from lidarfw.components.datasets.drives import (
     scans_in,
 )
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.types import Boxes, DataSpec, Frame, Points, Poses, Spec, Targets
+from lidarfw.types import Boxes, DataSpec, Frame, Points, Poses, Spec, Targets, Tracks
 
 if TYPE_CHECKING:
     import torch
@@ -48,7 +48,8 @@ class OxfordDataset(DriveDataset):
 
     Frames are the scans between the first and the last inertial pose. Points have one feature, the intensity 0..1.
     Targets are the LiDAR's pose (north, west, up; one origin for all traversals) and, with `boxes`, the objects of
-    TRAVERSAL/boxes/TIMESTAMP.txt, lines of class x y z l w h yaw in lidarfw's conventions.
+    TRAVERSAL/boxes/TIMESTAMP.txt, lines of class x y z l w h yaw in lidarfw's conventions; a track id may follow, and
+    where all objects of a frame have one, its tracks are targets too.
     """
 
     splits: ClassVar = {
@@ -131,7 +132,8 @@ class OxfordDataset(DriveDataset):
         targets = Targets(poses=pose)
         if self.boxes:
             labels = self._traversal(drive.name) / "boxes" / f"{drive.scans[place].stem}.txt"
-            targets.boxes = read_boxes(labels, self.classes)[0]
+            targets.boxes, tracks = read_boxes(labels, self.classes)
+            targets.tracks = Tracks(targets.boxes, tracks) if bool((tracks >= 0).all()) else None
         return Frame(inputs, targets, self.meta(index))
 
     def _traversal(self, name: str) -> Path:
