@@ -132,7 +132,7 @@ def of(triangles: npt.ArrayLike, surface: Surface) -> Mesh:
         table,
         np.full(count, surface.semantic, np.uint16),
         np.full(count, surface.reflectance, np.float32),
-        np.tile(np.array(surface.colour, np.float32), (count, 1)),
+        np.full((count, 3), surface.colour, np.float32),
         np.zeros(count, np.int32),
         np.full(count, surface.glow, np.float32),
     )
