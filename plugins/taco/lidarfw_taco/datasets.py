@@ -125,7 +125,7 @@ class Kitti360Relocalization(ChosenFrames, Kitti360Dataset):
 
     def chosen(self, drive: Drive) -> Places:
         """The first frames, or the later ones that return to them."""
-        every = np.arange(len(drive.scans))
+        every: Places = np.arange(len(drive.scans))
         if self.part == "train" or drive.poses is None:
             return every[: self.first]
         learned, later = drive.poses[: self.first, :3, 3], drive.poses[self.first :, :3, 3]
@@ -134,4 +134,5 @@ class Kitti360Relocalization(ChosenFrames, Kitti360Dataset):
             bool(len(places)) and drive.times[self.first + i] - drive.times[min(places)] >= self.apart
             for i, places in enumerate(near)
         ]
-        return every[self.first :][np.array(older, dtype=bool)]
+        found: Places = every[self.first :][np.array(older, dtype=bool)]
+        return found

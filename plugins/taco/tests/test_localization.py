@@ -306,7 +306,7 @@ def test_eight_scans_are_learned_by_heart() -> None:
     """Scans of one drive: map coordinates within 0.3 m, poses within 0.3 m, every object a peak of the heat map."""
     dataset = SyntheticDataset(frames=8, sequence_length=8, points=2048)
     batch = collate([dataset[number] for number in range(8)])
-    terms, model = learned(batch, model_overrides(), 150, 0.01)
+    terms, model = learned(batch, model_overrides(), 100, 0.01)
     assert float(terms["scene_coord"]["l1"].detach()) < 0.3
     with torch.no_grad():
         results = model.eval().predict(batch)  # type: ignore[attr-defined]

@@ -126,7 +126,8 @@ def _gain(covariance: Tensor, noise: float) -> tuple[Tensor, float]:
 
 def _shrunk(covariance: Tensor, gain: Tensor) -> Tensor:
     updated = covariance - torch.outer(gain, covariance[0])
-    return (updated + updated.T) / 2
+    symmetric: Tensor = (updated + updated.T) / 2
+    return symmetric
 
 
 def _rotation(vector: Tensor) -> Tensor:
@@ -143,4 +144,5 @@ def _turn(rotation: Tensor) -> Tensor:
     sine = skew.norm()
     angle = torch.atan2(sine, (rotation.diagonal().sum() - 1) / 2)
     scale = 1.0 if float(sine) < 1e-12 else float(angle / sine)
-    return scale * skew
+    scaled: Tensor = skew * scale
+    return scaled
