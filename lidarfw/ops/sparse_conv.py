@@ -143,11 +143,12 @@ def _compute_types(features: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 class SparseModule(nn.Module):
     """Base of the layers that take Voxels and give Voxels, so that `SparseSequential` knows them.
 
-    `torch.export` and ONNX, which cannot express them, are refused with advice.
+    `torch.export`, `torch.jit.trace` and ONNX, which cannot express them, are refused with advice.
     """
 
     def __call__(self, *args: Any, **kwargs: Any) -> Voxels:
-        if torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling():
+        exporting = torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()
+        if exporting or torch.jit.is_tracing():
             raise LidarfwError(
                 f"{type(self).__name__} cannot be exported: how many pairs a sparse layer has depends on the scan.\n"
                 "  Export the dense part behind it (neck and heads, which take a BEV); run the sparse backbone eagerly."

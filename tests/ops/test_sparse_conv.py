@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lidarfw.errors import LidarfwError
 from lidarfw.ops import (
     SparseAvgPool3d,
     SparseConv3d,
@@ -283,21 +282,6 @@ def test_autocast_on_the_cpu_computes_in_float32() -> None:
         output.features.sum().backward()
     assert output.features.dtype == torch.float32
     assert conv.weight.grad.dtype == torch.float32
-
-
-def test_export_says_what_to_do() -> None:
-    class Wrapper(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.conv = SubmanifoldConv3d(3, 4)
-
-        def forward(self, features: Tensor, index: Tensor) -> Tensor:
-            return self.conv(Voxels(features, index, Grid((0, 0, 0), (8, 9, 7), (1, 1, 1)), (7, 9, 8))).features
-
-    voxels = make_voxels(20, 3)
-    arguments = voxels.features.detach().float(), voxels.index
-    with pytest.raises(LidarfwError, match="Export the dense part"):
-        torch.export.export(Wrapper(), arguments, strict=False)
 
 
 def test_more_cells_than_an_int32_counts() -> None:
