@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lidarfw.model import PerceptionModel
 
 _FEATURE_SLOTS = ("backbone", "neck", "head")
-_LATER_SLOTS = ("loss", "postprocessor", "filter", "tracker", "retriever", "metric")
+_LATER_SLOTS = ("postprocessor", "filter", "tracker", "loss", "retriever", "metric")
 _LABEL_OF: dict[Any, type] = {  # what must be labelled to learn a prediction
     Boxes: Boxes, PointLabels: PointLabels, SceneCoords: Poses, Poses: Poses, Descriptors: Poses, Tracks: Tracks,
 }  # fmt: skip
@@ -237,7 +237,10 @@ class _Planner:
         return step
 
     def add_rest(self) -> None:
-        """Losses, postprocessors, filters, tracker, retriever, metrics; what is not selected comes from the heads."""
+        """Postprocessors, filters, tracker, losses, retriever, metrics; what is not selected comes from the heads.
+
+        The tracker comes before the losses, since a trainable one has losses of its own.
+        """
         heads = [step for step in self.steps if step.slot == "head"]
         for slot in _LATER_SLOTS:
             nodes = list(_nodes(self.config, slot, self.warnings))

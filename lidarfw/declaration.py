@@ -79,7 +79,7 @@ class Declaration:
     takes: tuple[Parameter, ...]
     special: tuple[str, ...]  # which of targets, meta, progress it takes
     gives: tuple[tuple[type, bool], ...]  # (kind, several levels?), in the order in which they are returned
-    output: str = ""  # path of the class that a head's forward returns
+    output: str = ""  # path of the class that the forward of a head or trainable tracker returns
     defaults: dict[str, list[str]] = field(default_factory=dict)
     trainable: tuple[Parameter, ...] | None = None  # parameters of a tracker's forward, where it has one
 
@@ -123,7 +123,7 @@ def _declare(entry: registry.Entry, source: _StaticClass | _ImportedClass) -> De
     decode = source.signature("decode") if entry.slot == "head" else None
     skip = ("state", "frame") if entry.slot in ("filter", "tracker") else ()
     takes = _parameters(entry, entrance, skip) if entry.slot not in ("dataset", "transform") else ()
-    output = forward.returns if forward is not None and entry.slot == "head" else None
+    output = forward.returns if forward is not None else None
     returns = decode.returns if decode is not None else entrance.returns
     return Declaration(
         entry,

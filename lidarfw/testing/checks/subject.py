@@ -176,9 +176,10 @@ def _specs(p: Parameter, variation: Any, heads: dict[str, Built]) -> Any:
 
 
 def _head_giving(p: Parameter) -> Subject:
-    found = [d.entry.name for d in declaration.all_declarations("head") if d.output == p.kind]
-    require(found, f"parameter {p.name!r} is the output {p.kind} of a head, but no installed head returns it")
-    return Subject("head", found[0])
+    slots = ("head", "tracker")
+    found = [(slot, d.entry.name) for slot in slots for d in declaration.all_declarations(slot) if d.output == p.kind]
+    require(found, f"parameter {p.name!r} is {p.kind}, which no installed head or tracker returns")
+    return Subject(*found[0])
 
 
 def _data_spec(subject: Subject) -> Any:
