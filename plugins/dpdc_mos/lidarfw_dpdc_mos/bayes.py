@@ -108,8 +108,7 @@ class BayesFilter(Filter):
         self.coefficients = adaptive or (math.log(prior / (1 - prior)), 0.0, 0.0)
         self.motion_compensation = motion_compensation
         self.moving = labels.classes.index(moving)
-        views = [spec.geometry for spec in data.inputs.values() if spec.kind is RangeImage]
-        self.view = next((view for view in views if isinstance(view, RangeView)), _HDL64)
+        self.view = range_view(data)
         if pose is None and transport != "point":
             warnings.warn(
                 "filter.bayes has no poses and takes the sensor as standing still.\n"
@@ -251,6 +250,12 @@ class BayesFilter(Filter):
         """(M,) int64 number of the cell of the map that each point lies in."""
         cell = ((xyz.double() @ pose[:3, :3].T + pose[:3, 3]) / self.cell).floor().long() + _SHIFT
         return (cell[:, 0] << 42) | (cell[:, 1] << 21) | cell[:, 2]
+
+
+def range_view(data: DataSpec) -> RangeView:
+    """The view of the data's range image, that of an HDL-64 (64 x 2048 pixels, +3 to -25 degrees) where it has none."""
+    views = [spec.geometry for spec in data.inputs.values() if spec.kind is RangeImage]
+    return next((view for view in views if isinstance(view, RangeView)), _HDL64)
 
 
 def _pose_matrix(pose: Poses | None, last: Observation | None) -> Tensor:

@@ -44,7 +44,14 @@ RANGE = [
     "transform.range_projection.height=16",
     "transform.range_projection.width=128",
 ]
-SMALL = ["backbone=dpdc", "backbone.dpdc.stem=8", "backbone.dpdc.widths=[16,16,16]", "neck=[]", "head=moving_seg", "metric=mean_iou"]
+SMALL = [
+    "backbone=dpdc",
+    "backbone.dpdc.stem=8",
+    "backbone.dpdc.widths=[16,16,16]",
+    "neck=[]",
+    "head=moving_seg",
+    "metric=mean_iou",
+]
 
 
 def frames(config: Any, count: int = 4) -> Any:
