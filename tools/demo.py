@@ -40,11 +40,11 @@ def scans() -> list[str]:
 
 def draw_town() -> Path:
     """A map of the first town that was trained on, and what its sensors see."""
-    from lidarfw_town.generate import Job, drive_of
+    from lidarfw_town.generate import Job
     from lidarfw_town.picture import write_picture
     from lidarfw_town.sensors import LIDARS
 
-    write_picture(RUN / "town.png", drive_of(Job("kitti", ""), 0).seed, LIDARS["hdl64"])
+    write_picture(RUN / "town.png", Job("kitti", "").town(0)[0], LIDARS["hdl64"])
     return RUN / "town.png"
 
 

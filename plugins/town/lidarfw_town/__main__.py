@@ -23,14 +23,14 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--seed", type=int, default=1, help="another seed is another town (default: 1)")
     made.add_argument("--frames", type=int, default=100, help="how many frames (default: 100)")
     made.add_argument("--sensor", choices=[*LIDARS], default="hdl64", help="the LiDAR (default: hdl64)")
-    made.add_argument("--split", default="train", help="layout kitti: the list in ImageSets; val is another town")
+    made.add_argument("--split", default="train", help="of the layout; others are other towns or traversals")
     made.add_argument("--length", type=int, default=0, help="frames of one drive (default: the layout's)")
     made.add_argument("--stride", type=int, default=0, help="steps of 0.1 s between frames (default: the layout's)")
     made.add_argument("--traversal", type=int, default=0, help="another drive through the same town")
     made.add_argument("--weather", choices=[*WEATHER], default="clear")
     made.add_argument("--picture-width", type=int, default=1242, help="pixels, 0 for no pictures (default: 1242)")
     made.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
-    made.add_argument("--picture", action="store_true", help="draw the town instead: map, camera, scan")
+    made.add_argument("--picture", action="store_true", help="draw the first of the towns instead: map, pictures, scan")
     return made
 
 
@@ -39,12 +39,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser().parse_args(arguments)
     values = {key: value for key, value in vars(given).items() if key not in ("out", "workers", "picture")}
     try:
+        job = Job(root=given.out, **values)
         if given.picture:
             from lidarfw_town.picture import write_picture
 
-            write_picture(given.out, given.seed, LIDARS[given.sensor], given.traversal, given.weather)
+            job.check()
+            seed, traversal = job.town(0)
+            write_picture(given.out, seed, LIDARS[given.sensor], traversal, given.weather)
         else:
-            generate(Job(root=given.out, **values), given.workers)
+            generate(job, given.workers)
     except LidarfwError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -37,8 +37,8 @@ class TownDataset(Dataset):
 
     `layout` is that of the files; `made` says which of its splits each split of the dataset reads. Options that all
     have: sensor (hdl64, hdl32, ouster32 or small); seed (another one is another town); picture_width in pixels, 0 for
-    no pictures; weather (clear, rain or fog); cache, the folder of folders (empty: lidarfw/town in $XDG_CACHE_HOME or
-    ~/.cache); workers, the processes that make the files (0: one a core).
+    no pictures; weather (clear, rain, fog or night); cache, the folder of folders (empty: lidarfw/town in
+    $XDG_CACHE_HOME or ~/.cache); workers, the processes that make the files (0: one a core).
     """
 
     layout: ClassVar[str]

@@ -81,6 +81,14 @@ class Job:
         """All frames."""
         return [Place(n // self.per_drive, n % self.per_drive, n) for n in range(self.frames)]
 
+    def town(self, drive: int) -> tuple[int, int]:
+        """The seed of the town of a drive, and the number of the traversal."""
+        layout, seed = LAYOUTS[self.layout], self.seed * 1000
+        if layout.one_town:
+            return seed, self.traversal + layout.traversal(self.split, drive)
+        # the towns of the splits and of neighbouring seeds differ
+        return seed + drive + (500 if self.split != "train" else 0), self.traversal
+
     def writer(self) -> Layout:
         """The layout at its folder."""
         return LAYOUTS[self.layout](Path(self.root), self.picture_width, self.split)
@@ -106,7 +114,8 @@ class Job:
                 raise DataError(
                     f"{self.root} holds a town of other settings ({text}).\n  fix: another folder, or delete it"
                 )
-        write_text(own, json.dumps(wanted, indent=1) + "\n")
+        if not own.is_file():
+            write_text(own, json.dumps(wanted, indent=1) + "\n")
 
     @property
     def complete(self) -> bool:
@@ -205,19 +214,12 @@ def _chunks(places: list[Place], workers: int) -> list[list[Place]]:
 
 def drive_of(job: Job, number: int) -> Drive:
     """The drive of that number of a set."""
-    layout = LAYOUTS[job.layout]
-    seed, traversal = job.seed * 1000, job.traversal
-    if layout.one_town:
-        traversal += layout.traversal(job.split, number)
-    else:  # the towns of the splits and of neighbouring seeds differ
-        seed += number + (500 if job.split != "train" else 0)
-    return _drive(
-        seed, _LEAD + job.per_drive * job.step, job.sensor, traversal, job.weather, layout.compensated, layout.one_town
-    )
+    layout, steps = LAYOUTS[job.layout], _LEAD + job.per_drive * job.step
+    return _drive(*job.town(number), steps, job.sensor, job.weather, layout.compensated, layout.one_town)
 
 
 @functools.lru_cache(maxsize=1)
-def _drive(seed: int, steps: int, sensor: str, traversal: int, weather: str, compensated: bool, circuit: bool) -> Drive:
+def _drive(seed: int, traversal: int, steps: int, sensor: str, weather: str, compensated: bool, circuit: bool) -> Drive:
     """Made once for all of its frames, whatever their layout."""
     return Drive(
         seed, steps, LIDARS[sensor], traversal=traversal, compensated=compensated, weather=weather, circuit=circuit,

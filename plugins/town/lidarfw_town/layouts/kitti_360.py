@@ -73,7 +73,7 @@ class Kitti360Layout(Layout):
         write_png(self.root / "data_2d_raw" / drive / name / kind / file, shot.image)
         depth = np.minimum(np.round(shot.depth * 256), 2**16 - 1).astype(np.uint16)
         write_png(self.root / "data_2d_depth" / drive / name / file, depth)
-        semantic = labels_of(shot, rays_of(camera)[1].any(1).reshape(shot.depth.shape))
+        semantic = labels_of(shot, np.asarray(rays_of(camera)[1].any(1)).reshape(shot.depth.shape))
         write_png(self.root / "data_2d_semantics" / "train" / drive / name / "semantic" / file, semantic)
 
     def finish(self, parts: Sequence[Sequence[dict[str, Any]]]) -> None:
