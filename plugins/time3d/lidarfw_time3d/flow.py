@@ -174,7 +174,7 @@ class TemporalFlow(nn.Module):
 
 def masked(logits: Tensor, past_mask: Tensor, now_mask: Tensor) -> Tensor:
     """Logits (P, Kp + 1, Kn + 1) with -1e9 where a place is empty; "none" is always there."""
-    one = torch.ones_like(past_mask[:, :1])
+    one = past_mask.new_ones(len(past_mask), 1)
     there = torch.cat([past_mask, one], 1)[:, :, None] & torch.cat([now_mask, one], 1)[:, None]
     return torch.where(there, logits, -1e9)
 

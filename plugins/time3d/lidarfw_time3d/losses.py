@@ -10,7 +10,7 @@ from lidarfw.ops import box_corners
 from lidarfw.types import Boxes, Spec, Targets
 from torch import Tensor
 
-from lidarfw_time3d.flow import association, refine
+from lidarfw_time3d.flow import association, masked, refine
 from lidarfw_time3d.time3d import Time3DOutput
 
 _NEAR = 2.0  # metres on the ground between a box and the object that it stands for
@@ -47,9 +47,7 @@ class AssociationLoss(Loss):
         past, now = (_slots(identity, rows) for rows in (flow.past, flow.now))
         logits = flow.logits
         if self.masked:
-            empty = torch.ones_like(past[:, :1], dtype=torch.bool)
-            keep = torch.cat([past != FALSE, empty], 1)[:, :, None] & torch.cat([now != FALSE, empty], 1)[:, None]
-            logits = torch.where(keep, logits, -1e9)
+            logits = masked(logits, past != FALSE, now != FALSE)
         return {"association": association_loss(logits, past, now, self.none, self.symmetric, self.masked)}
 
 
