@@ -71,7 +71,7 @@ def range_knn(image: RangeImage, labels: Tensor, distance: Tensor, window: int =
     offset = torch.arange(window) - margin
     bell = torch.exp(-(offset[:, None] ** 2 + offset**2) / 2).flatten()
     weight = 1 - bell / bell.sum()
-    ranges = torch.where(image.mask, image.xyz.norm(dim=1), torch.inf)
+    ranges = torch.where(image.mask, image.xyz.square().sum(1).sqrt(), torch.inf)
     ranges, labels_ = (F.pad(t.float()[:, None], (margin, margin, 0, 0), "circular") for t in (ranges, labels))
     ranges, labels_ = F.pad(ranges, (0, 0, margin, margin), value=torch.inf), F.pad(labels_, (0, 0, margin, margin))
     points = image.pixel >= 0

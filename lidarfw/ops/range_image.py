@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import combinations
 
 import torch
 from torch import Tensor
@@ -56,7 +57,7 @@ def residual_images(
     the current sensor frame already. Only ranges between `nearest` and `farthest` metres count, on both sides.
     `signed` gives `(r_past - r) / r`: positive where something has come in front of what was seen before.
     """
-    now = current.xyz.norm(dim=1)[:, None]
+    now = _range_of(current)[:, None]
     before = torch.stack([_nearest_range(points, current.view) for points in past], 1)
     both = current.mask[:, None] & torch.isfinite(before)
     both &= (now > nearest) & (now < farthest) & (before > nearest) & (before < farthest)
@@ -71,6 +72,11 @@ def _nearest_range(points: Points, view: RangeView) -> Tensor:
     nearest = distance.new_full((pixels + 1,), torch.inf)
     nearest.scatter_reduce_(0, torch.where(pixel < 0, pixels, pixel), distance, "amin")
     return nearest[:pixels].view(points.batch_size, view.height, view.width)
+
+
+def _range_of(image: RangeImage) -> Tensor:
+    """(B, H, W) metres; on a CPU several times as fast as `norm`, which does not vectorise over planes."""
+    return image.xyz.square().sum(1).sqrt_()
 
 
 def range_knn(
@@ -161,7 +167,7 @@ def _neighbors(
         raise ValueError(f"range_knn: window must be odd and at most 15, got {window}")
     _, height, columns = image.mask.shape
     margin, width = window // 2, columns + window // 2 * 2
-    ranges = _surround(torch.where(image.mask, image.xyz.norm(dim=1), torch.inf), margin, torch.inf).flatten()
+    ranges = _surround(torch.where(image.mask, _range_of(image), torch.inf), margin, torch.inf).flatten()
     line = torch.arange(window, dtype=torch.int32, device=ranges.device)
     offsets = (line[:, None] * width + line).flatten()
     weights = [1.0] * window**2
@@ -221,6 +227,10 @@ def _surround(image: Tensor, margin: int, value: float) -> Tensor:
 
 def _majority(labels: Tensor, counts: Tensor) -> Tensor:
     """(N,) most frequent of the labels (K, N) where `counts` (K, N) is True; the lowest of equally frequent ones."""
-    votes = ((labels[:, None] == labels) & counts).sum(1) * counts
-    order = (votes << 32) - labels
-    return labels.gather(0, order.argmax(0, keepdim=True))[0]
+    votes = counts.to(torch.uint8)
+    for one, other in combinations(range(len(labels)), 2):
+        same = (labels[one] == labels[other]) & counts[one] & counts[other]
+        votes[one] += same
+        votes[other] += same
+    order = (votes.long() << 32) - labels  # one maximum finds the most votes and the lowest label
+    return -order.amax(0) & 0xFFFFFFFF
