@@ -25,7 +25,7 @@ class SmootherState:
 
 
 class PoseSmoother(Filter):
-    """A Kalman filter over the poses of a stream: constant velocity and turn rate (Bar-Shalom et al., 2001, 6.3.2).
+    """A Kalman filter over the poses of a stream: constant speed and turn rate (Bar-Shalom et al., 2001, 6.3.2, 11.7).
 
     A pose that is not ok, or lies more than `gate` standard deviations from where the motion leads, is not believed:
     the predicted pose takes its place and stays ok for `max_missed` frames, then the filter starts anew with the next
@@ -84,10 +84,10 @@ class PoseSmoother(Filter):
 
     def _predict(self, state: SmootherState, seconds: float) -> None:
         matrix, velocity, turn = state.matrix, state.velocity, state.turn
-        moved = matrix.clone()
-        moved[:3, :3] = _rotation(turn * seconds) @ matrix[:3, :3]
+        turned, moved = _rotation(turn * seconds), matrix.clone()
+        moved[:3, :3] = turned @ matrix[:3, :3]
         moved[:3, 3] += velocity * seconds
-        state.matrix = moved
+        state.matrix, state.velocity = moved, turned @ velocity  # a vehicle turns where it drives
         state.place_covariance = _grown(state.place_covariance, seconds, self.acceleration)
         state.angle_covariance = _grown(state.angle_covariance, seconds, self.angular_acceleration)
 
