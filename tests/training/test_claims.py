@@ -31,7 +31,6 @@ block: 4
 runs:
   trained: []
   same: ["name=another"]
-  likewise: [trainer.log_every_n_steps=3]
   untrained: [optimizer.lr=1e-7]
   delayed: {{overrides: [], eval: [filter=delay]}}
 claims:
@@ -42,16 +41,10 @@ claims:
     variant: trained
     metric: toy/accuracy
     better: higher
-  logging:
-    claim: Logging more often helps
-    baseline: trained
-    variant: likewise
-    metric: toy/accuracy
-    better: higher
-  naming:
-    claim: Another name is worse
-    baseline: delayed
-    variant: same
+  delaying:
+    claim: Another name and a delay are worse
+    baseline: same
+    variant: delayed
     metric: toy/accuracy
     better: lower
   forgetting:
@@ -141,11 +134,10 @@ def test_effects_are_found_and_nothing_runs_twice(file, tmp_path, start, capsys)
     assert main(arguments) == 0
     verdicts = table_of(out)
     assert verdicts["Training helps"] == "**supported**"
-    assert verdicts["Logging more often helps"] == "**neutral**"
-    assert verdicts["Another name is worse"] == "**neutral**"
+    assert verdicts["Another name and a delay are worse"] == "**neutral**"
     assert verdicts["Training hurts"].startswith("**contradicted** (long")  # its runs are those of the first claim
     # trained, same and delayed are one training; same and trained one evaluation
-    assert (start.of("train"), start.of("eval")) == (3 * 2, 4 * 2)
+    assert (start.of("train"), start.of("eval")) == (2 * 2, 3 * 2)
 
     figures = {entry["name"]: entry for entry in json.loads((out / "toy.json").read_text())["claims"]}
     outcome = figures["training"]["outcome"]
@@ -165,12 +157,12 @@ def test_effects_are_found_and_nothing_runs_twice(file, tmp_path, start, capsys)
     file.write_text(file.read_text().replace("claim: Training helps", "claim: Training does help"))
     assert main([*arguments[:-1], str(tmp_path / "elsewhere"), "--minutes", "0"]) == 0
     later = table_of(out)
-    assert (later["Training does help"], later["Logging more often helps"]) == ("not run", "**neutral**")
-    assert "6 of 6 runs are left" in capsys.readouterr().err
+    assert (later["Training does help"], later["Another name and a delay are worse"]) == ("not run", "**neutral**")
+    assert "4 of 4 runs are left" in capsys.readouterr().err
 
 
 def test_a_run_that_was_stopped_or_killed_goes_on(file, tmp_path, start):
-    stated = reading.read(file, ["trainer.max_epochs=12"])
+    stated = reading.read(file, ["trainer.max_epochs=8"])
     claims = [replace(stated.claims[0], baseline=0.5, seeds=(1,))]
     whole = running.Work(stated, claims, tmp_path / "whole")
     running.Runner(whole).run()
@@ -229,14 +221,14 @@ def test_a_budget_starts_nothing_that_cannot_end_in_time(file, tmp_path, start):
 
 def test_a_run_that_fails_is_named_and_the_others_go_on(file, tmp_path, start, capsys):
     text = file.read_text().replace("untrained: [optimizer.lr=1e-7]", "untrained: [dataset.toy.poison=3]")
-    file.write_text(text.replace("seeds: [1, 2]", "seeds: [1]").replace("baseline: trained", "baseline: 0.01"))
+    file.write_text(text.replace("seeds: [1, 2]", "seeds: [1]").replace("baseline: same", "baseline: 1.01"))
     arguments = ["claims", str(file), "-o", str(tmp_path / "out"), "--runs", str(tmp_path / "runs")]
-    assert main([*arguments, "--only", "training", "logging"]) == 1
+    assert main([*arguments, "--only", "training", "delaying"]) == 1
     error = capsys.readouterr().err
     assert "failed: untrained, seed 1: exit code 2" in error
     assert "is nan" in error
     assert table_of(tmp_path / "out")["Training helps"] == "not run"
-    assert table_of(tmp_path / "out")["Logging more often helps"] == "**supported**"
+    assert table_of(tmp_path / "out")["Another name and a delay are worse"] == "**supported**"
 
 
 def test_only_one_process_makes_a_run(file, tmp_path, start):
