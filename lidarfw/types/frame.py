@@ -31,6 +31,7 @@ class FrameMeta:
     cameras: dict[str, Camera] = field(default_factory=dict)  # calibration by input name
     path: str = ""  # file of the main sensor
     images: dict[str, str] = field(default_factory=dict)  # picture files by camera name, for drawing
+    modality: str = ""  # "camera" or "lidar", where a frame shows a place by one of the two
 
 
 @dataclass

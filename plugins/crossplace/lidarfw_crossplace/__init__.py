@@ -1,0 +1,1 @@
+"""CrossPlace: place recognition between fisheye cameras and LiDAR."""
