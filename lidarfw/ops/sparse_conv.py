@@ -148,7 +148,7 @@ class SparseModule(nn.Module):
 
     def __call__(self, *args: Any, **kwargs: Any) -> Voxels:
         exporting = torch.compiler.is_compiling() and not torch.compiler.is_dynamo_compiling()
-        if exporting or torch.jit.is_tracing():  # type: ignore[no-untyped-call]
+        if exporting or torch.jit.is_tracing():  # type: ignore[attr-defined, no-untyped-call]
             raise LidarfwError(
                 f"{type(self).__name__} cannot be exported: how many pairs a sparse layer has depends on the scan.\n"
                 "  Export the dense part behind it (neck and heads, which take a BEV); run the sparse backbone eagerly."
