@@ -18,6 +18,7 @@ from lightning.pytorch.loggers.logger import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from lidarfw.files import atomic_path
+from lidarfw.types import collate
 
 log = logging.getLogger(__name__)
 TERMINATED = 143  # exit code of a process that ended on SIGTERM: 128 + 15
@@ -251,3 +252,25 @@ class MetricsFile(Logger):
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
+
+
+class SettledNorms(pl.Callback):
+    """After the last batch of a training, set the statistics of batch normalisation anew (`lidarfw.norms`).
+
+    From the first `batches` batches of that epoch, before the last validation and checkpoint. For short trainings and
+    small batches, whose running statistics lag behind the weights. On several processes each uses its own frames.
+    """
+
+    def __init__(self, batches: int = 50) -> None:
+        self.batches = batches
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Settle them if the training is at its end."""
+        if not trainer.is_last_batch or trainer.current_epoch + 1 != trainer.max_epochs:
+            return
+        from lidarfw.norms import settle_norms
+
+        loader: Any = trainer.train_dataloader
+        count = min(self.batches, len(loader))
+        read = (loader.samples.__getitems__(loader.order.batch(place))[0] for place in range(count))
+        settle_norms(pl_module.model, (collate(frames).to(pl_module.device) for frames in read if frames))
