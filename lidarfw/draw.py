@@ -114,7 +114,7 @@ def plan_view(
     for number, path in paths.items():
         axes.plot(path[:, 1], path[:, 0], color=colours[number], linewidth=1.2)
         if len(path) >= 10:
-            axes.annotate(f"#{number}", path[-1, ::-1], fontsize=7, color=colours[number])
+            axes.annotate(f"#{number}", (path[-1, 1], path[-1, 0]), fontsize=7, color=colours[number])
     axes.plot(own[:, 1], own[:, 0], color="#000000", linewidth=1.6)
     axes.set(xlim=(high[1], low[1]), ylim=(low[0], high[0]), aspect="equal", xlabel="y (m)", ylabel="x (m)")
     axes.grid(True, color="#DDDDDD", linewidth=0.6)

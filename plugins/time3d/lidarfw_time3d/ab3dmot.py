@@ -156,6 +156,7 @@ def _rule(usual: dict[str, Any], own: dict[str, Any], name: str) -> dict[str, An
 def _cost(found: Array, tracked: Array, measure: str) -> Array:
     """(N, M) cost of the pairs of detections (N, 7) and tracks (M, 7)."""
     if measure == "distance":
-        return np.linalg.norm(found[:, None, :3] - tracked[None, :, :3], axis=2)
+        apart: Array = np.linalg.norm(found[:, None, :3] - tracked[None, :, :3], axis=2)
+        return apart
     one, two = (torch.from_numpy(rows[:, [0, 1, 2, 4, 5, 6, 3]]) for rows in (found, tracked))
     return -array(giou_3d(one, two) if measure == "giou_3d" else iou_3d(one, two))

@@ -40,6 +40,8 @@ from lidarfw_time3d.frames import array, rows_of, to_map, to_sensor
 from lidarfw_time3d.kalman import Array
 from lidarfw_time3d.kalman_confidence import KalmanConfidence
 
+Bool = npt.NDArray[np.bool_]
+
 SPECIAL = ("car",)  # classes with enough objects for a network of their own, with features of place and size
 IOU = 0.25
 _COASTED = 10.0  # a detected box goes before a coasted one where both could be the object's
@@ -53,8 +55,8 @@ class Samples:
 
     features: Array  # (N, 24)
     label: npt.NDArray[np.int64]  # (N,)
-    right: npt.NDArray[np.bool_]  # (N,)
-    counts: npt.NDArray[np.bool_]  # (N,) neither ignored nor excused
+    right: Bool  # (N,)
+    counts: Bool  # (N,) neither ignored nor excused
 
 
 @dataclass
@@ -87,7 +89,7 @@ def _targets(lines: list[kitti.TrackLabel], upright: kitti.Calibration, classes:
     return Targets(boxes=boxes, ignored=ignored, tracks=Tracks(boxes, ids[boxes.row]))
 
 
-def judge(found: Boxes, coasted: npt.NDArray[np.bool_], targets: Targets, frame: Detections) -> tuple[Array, Array]:
+def judge(found: Boxes, coasted: Bool, targets: Targets, frame: Detections) -> tuple[Bool, Bool]:
     """(M,) whether each box is right, and whether it counts, by the rules of KITTI tracking."""
     boxes, ignored = targets.boxes, targets.ignored
     assert boxes is not None
@@ -106,12 +108,12 @@ def judge(found: Boxes, coasted: npt.NDArray[np.bool_], targets: Targets, frame:
     return right, counts
 
 
-def _excused(found: Boxes, ignored: Boxes, frame: Detections) -> npt.NDArray[np.bool_]:
+def _excused(found: Boxes, ignored: Boxes, frame: Detections) -> Bool:
     level = kitti.level_boxes(found, frame.meta.cameras)
     rectangle = kitti.project_level_boxes(level, frame.meta.cameras)
     regions = ignored[ignored.label < 0].box2d
     covered = share_covered(rectangle, np.zeros((0, 4)) if regions is None else array(regions))
-    low: npt.NDArray[np.bool_] = (rectangle[:, 3] - rectangle[:, 1] <= 25) | (covered > 0.5)
+    low: Bool = (rectangle[:, 3] - rectangle[:, 1] <= 25) | (covered > 0.5)
     return low
 
 
@@ -120,15 +122,15 @@ def calibrate(data: Sequence[Labelled], classes: Sequence[str]) -> dict[str, lis
 
     Boxes of an object in successive frames are much alike, so ten count as one against the prior.
     """
-    rows = [[f.boxes, *judge(f.boxes, np.zeros(len(f.boxes), dtype=bool), t, f)]
-            for entry in data for f, t in zip(entry.sequence.frames, entry.targets, strict=True)]  # fmt: skip
-    found = Boxes.cat([row[0] for row in rows])
-    right, counts = (np.concatenate([row[k] for row in rows]) for k in (1, 2))
+    frames = [pair for entry in data for pair in zip(entry.sequence.frames, entry.targets, strict=True)]
+    verdicts = [judge(f.boxes, np.zeros(len(f.boxes), dtype=bool), t, f) for f, t in frames]
+    found = Boxes.cat([frame.boxes for frame, _ in frames])
+    right, counts = (np.concatenate(column) for column in zip(*verdicts, strict=True))
     return {name: _platt(array(found.score), right, counts & (found.label.numpy() == number))
             for number, name in enumerate(classes)}  # fmt: skip
 
 
-def _platt(score: Array, right: Array, used: npt.NDArray[np.bool_]) -> list[float]:
+def _platt(score: Array, right: Bool, used: Bool) -> list[float]:
     x, sign = score[used], np.where(right[used], 1.0, -1.0)
     prior = np.array(_PRIOR)
 
@@ -175,7 +177,8 @@ class Ensemble(nn.Module):
         hidden = (values - self.mean) / self.scale
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             hidden = (hidden @ weight + bias).relu()
-        return (hidden @ self.weights[-1] + self.biases[-1])[..., 0]
+        odds: Tensor = (hidden @ self.weights[-1] + self.biases[-1])[..., 0]
+        return odds
 
     def plain(self, names: Sequence[str]) -> dict[str, Any]:
         """Weights as lists, the normalisation of the features folded into the first layer."""
@@ -210,7 +213,7 @@ def train(samples: Sequence[Samples], names: Sequence[str], weight: Sequence[flo
         error = nn.functional.binary_cross_entropy_with_logits(model(values[rows]), right[rows], reduction="none")
         loss = ((error * share[rows]).sum(1) / share[rows].sum(1)).sum()
         optimizer.zero_grad()
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
     return model.plain(names)

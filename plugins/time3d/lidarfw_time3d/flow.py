@@ -63,7 +63,7 @@ class CueEmbedding(nn.Module):
             nn.Linear(inputs, width), nn.ReLU(), nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU(),
             nn.LayerNorm(width),
         )  # fmt: skip
-        self.classes, self.width, self.dropout = classes, width, dropout
+        self.classes, self.width, self.looks, self.dropout = classes, width, appearance, dropout
 
     def forward(
         self, boxes: Tensor, label: Tensor, score: Tensor, box2d: Tensor | None, appearance: Tensor | None
@@ -72,11 +72,10 @@ class CueEmbedding(nn.Module):
         corners = box_corners(boxes.reshape(-1, 7)).reshape(*boxes.shape[:2], 8, 3)
         parts = [self.box3d(waves(corners))]
         known = boxes.new_zeros(*boxes.shape[:2], 4) if box2d is None else box2d / _PIXELS
-        rectangle = known[..., [0, 1, 0, 3, 2, 1, 2, 3]].unflatten(-1, (4, 2))
+        rectangle = known[..., [0, 1, 0, 3, 2, 1, 2, 3]].reshape(*known.shape[:-1], 4, 2)
         parts.append(self._or_absent(self.box2d(rectangle), 0, box2d is not None))
         if self.appearance is not None:
-            width = self.appearance[0].normalized_shape[0]
-            seen = boxes.new_zeros(*boxes.shape[:2], width) if appearance is None else appearance
+            seen = boxes.new_zeros(*boxes.shape[:2], self.looks) if appearance is None else appearance
             parts.append(self._or_absent(self.appearance(seen), 1, appearance is not None))
         category = nn.functional.one_hot(label, self.classes).to(boxes.dtype)
         result: Tensor = self.join(torch.cat([*parts, self.category(category), score[..., None]], -1))
@@ -133,8 +132,8 @@ class TemporalFlow(nn.Module):
         self.newborn, self.lost = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(()))
         self.seconds, self.out = nn.Linear(1, width), nn.Linear(width, width)
         self.velocity, self.refine = mlp((width, width, width, 3)), mlp((width, width, width, 6))
-        nn.init.zeros_(self.refine[-1].weight)  # refinement starts at none
-        nn.init.zeros_(self.refine[-1].bias)
+        for parameter in self.refine[-1].parameters():
+            nn.init.zeros_(parameter)  # refinement starts at none
         self.heads = heads
 
     def forward(
@@ -161,7 +160,8 @@ class TemporalFlow(nn.Module):
     def _products(self, past: Tensor, now: Tensor) -> Tensor:
         """(P, H, Kp, Kn) scaled products of keys of the past and queries of now, per head."""
         query, key = (layer(x).unflatten(-1, (self.heads, -1)) for layer, x in ((self.query, now), (self.key, past)))
-        return torch.einsum("pihc,pjhc->phij", key, query) * query.shape[-1] ** -0.5
+        product: Tensor = torch.einsum("pihc,pjhc->phij", key, query) * query.shape[-1] ** -0.5
+        return product
 
     def bordered(self, logits: Tensor, past_mask: Tensor, now_mask: Tensor) -> Tensor:
         """(P, Kp + 1, Kn + 1): with the row and column of "none", empty places at -1e9."""

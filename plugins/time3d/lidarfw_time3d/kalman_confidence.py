@@ -17,7 +17,7 @@ from lidarfw_time3d.kalman import Array, Int, Motion, Noise
 
 NOISE = Noise(measured=0.1, place=0.02, shape=0.01, velocity=0.2, first=0.1, first_velocity=100.0)
 _RIVAL = FEATURES.index("rival_same")
-_HOPELESS = 0.005  # chance at which an unseen track ends
+_HOPELESS = 0.015  # chance at which an unseen track ends
 _REST = 0.7  # m/s below which an unseen object is taken to stand still
 _NEWBORN = 1.5  # times the gate for a track whose velocity is not known yet
 _GROWTH = 0.12  # of the gate per unseen frame
