@@ -97,22 +97,7 @@ def _gradients(
     d_weight = torch.zeros_like(weight) if need_weight else None
     for block in book.blocks():
         products = scratch("products", block.pairs, weight.shape[1], gradient)
-        arrived = scratch("rows", padded(max(block.sizes)), weight.shape[2], gradient)
-        seen = scratch("features", max(block.sizes), weight.shape[1], features)
-        runs = zip(
-            block.inputs,
-            block.outputs,
-            block.sizes,
-            block.elements,
-            products.split_with_sizes(block.sizes),
-            strict=True,
-        )
-        for inputs, outputs, size, element, product in runs:
-            rows = torch.index_select(gradient, 0, inputs, out=arrived[:size])
-            if d_weight is not None:
-                d_weight[element].addmm_(torch.index_select(features, 0, outputs, out=seen[:size]).t(), rows)
-            if need_features:
-                multiply(arrived, flipped[element], product)
+        _block_gradients(block, features, gradient, flipped, products if need_features else None, d_weight)
         if d_features is not None:
             d_features[block.rows] = sum_block(block, products)
     if book.symmetric:
@@ -122,6 +107,27 @@ def _gradients(
         if d_weight is not None:
             torch.mm(features.t(), gradient, out=d_weight[centre])
     return d_features, d_weight
+
+
+def _block_gradients(
+    block: Block,
+    features: Tensor,
+    gradient: Tensor,
+    flipped: tuple[Tensor, ...],
+    products: Tensor | None,
+    d_weight: Tensor | None,
+) -> None:
+    """Fill the products (pairs, C_in) that sum to the gradient of the features; add to the gradient of the weight."""
+    arrived = scratch("rows", padded(max(block.sizes)), gradient.shape[1], gradient)
+    seen = scratch("features", max(block.sizes), features.shape[1], features)
+    start = 0
+    for inputs, outputs, size, element in zip(block.inputs, block.outputs, block.sizes, block.elements, strict=True):
+        rows = torch.index_select(gradient, 0, inputs, out=arrived[:size])
+        if d_weight is not None:
+            d_weight[element].addmm_(torch.index_select(features, 0, outputs, out=seen[:size]).t(), rows)
+        if products is not None:
+            multiply(arrived, flipped[element], products[start : start + size])
+        start += size
 
 
 def triple(value: int | tuple[int, int, int]) -> Triple:
