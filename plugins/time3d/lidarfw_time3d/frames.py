@@ -43,6 +43,15 @@ def to_sensor(rows: Array, pose: Array) -> Array:
     return moved
 
 
+def velocity_of(boxes: Boxes, pose: Array) -> Array | None:
+    """(M, 3) m/s of boxes in the tracking frame; None where the detector gives no velocity, 0 where it is NaN."""
+    if boxes.velocity is None:
+        return None
+    flat = np.nan_to_num(array(boxes.velocity))
+    turned: Array = flat @ pose[:3, :2].T
+    return turned
+
+
 def heading_of(pose: Array) -> float:
     """Yaw of the sensor in the tracking frame."""
     return math.atan2(pose[1, 0], pose[0, 0])

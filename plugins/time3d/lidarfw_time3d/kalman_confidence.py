@@ -12,7 +12,16 @@ from lidarfw.types import Boxes, FrameResult, Poses, Spec, Tracks
 
 from lidarfw_time3d.assignment import gated_hungarian
 from lidarfw_time3d.confidence import FEATURES, Confidence, Evidence, features, log_odds
-from lidarfw_time3d.frames import array, boxes_of, pose_of, rows_of, seconds_since, to_map, to_sensor
+from lidarfw_time3d.frames import (
+    array,
+    boxes_of,
+    pose_of,
+    rows_of,
+    seconds_since,
+    to_map,
+    to_sensor,
+    velocity_of,
+)
 from lidarfw_time3d.kalman import Array, Int, Motion, Noise
 
 NOISE = Noise(measured=0.1, place=0.02, shape=0.01, velocity=0.2, first=0.1, first_velocity=100.0)
@@ -44,7 +53,7 @@ class KalmanConfidence(Tracker):
     of a class are matched by the distance of their centres on the ground, within `gate` metres (by class name,
     `default_gate` for the others; wider for new and for unseen tracks): first the detections that are more probably
     right than wrong, then the others with the tracks left (Zhang et al., "ByteTrack", ECCV 2022). Every detection
-    without a track starts one.
+    without a track starts one, with the velocity that the detector gives, if it does.
 
     What comes out is decided by `confidence.Confidence`: from all that was seen of a track up to this frame (hits,
     age, scores, distance from the prediction, rivals at the same place) it gives the probability that its box is
@@ -104,7 +113,7 @@ class KalmanConfidence(Tracker):
         state.time, state.pose = frame.meta.time, pose_of(pose, state.pose)
         label = boxes.label.cpu().numpy()
         score = log_odds(array(boxes.score), label, self.calibration)
-        self.advance(state, to_map(rows_of(boxes), state.pose), label, score, passed)
+        self.advance(state, to_map(rows_of(boxes), state.pose), label, score, passed, velocity_of(boxes, state.pose))
         box = to_sensor(state.motion.box, state.pose)
         values = self.features(state, box)
         chance = self.confidence.probability(values, state.label, self.classes)
@@ -115,8 +124,19 @@ class KalmanConfidence(Tracker):
         self._end(state, chance)
         return [replace(frame, tracks=tracks)]
 
-    def advance(self, state: KalmanConfidenceState, found: Array, label: Int, score: Array, passed: float) -> None:
-        """Move the tracks on by `passed` seconds and join the detections (N, 7) of the tracking frame to them."""
+    def advance(
+        self,
+        state: KalmanConfidenceState,
+        found: Array,
+        label: Int,
+        score: Array,
+        passed: float,
+        velocity: Array | None = None,
+    ) -> None:
+        """Move the tracks on by `passed` seconds and join the detections (N, 7) of the tracking frame to them.
+
+        New tracks start with the `velocity` (N, 3) that the detector gives, else at rest.
+        """
         state.frames += 1
         slow = (state.evidence.missed > 0) & (np.hypot(*state.motion.velocity[:, :2].T) < _REST)
         state.motion.velocity[slow] = 0
@@ -126,7 +146,7 @@ class KalmanConfidence(Tracker):
         state.motion.update(track, found[detection], NOISE)
         state.evidence.see(track, score[detection], off)
         new = np.delete(np.arange(len(found)), detection)
-        state.motion = state.motion.join(Motion.start(found[new], NOISE))
+        state.motion = state.motion.join(Motion.start(found[new], NOISE, None if velocity is None else velocity[new]))
         state.evidence = state.evidence.join(Evidence.start(score[new]))
         state.label = np.concatenate([state.label, label[new]])
         state.id = np.concatenate([state.id, state.next_id + np.arange(len(new))])

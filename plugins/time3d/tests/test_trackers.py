@@ -221,6 +221,22 @@ def test_a_lost_object_is_found_again_under_its_id() -> None:
     assert out[9].id.tolist() == out[16].id.tolist() == out[19].id.tolist() == [1]
 
 
+def test_the_velocity_that_a_detector_gives_starts_a_track() -> None:
+    """At two frames a second a car that drives 8 m between them is found again only by its velocity."""
+    drive = [boxes([(10 + 8.0 * t, 0, 0)]) for t in range(6)]
+    told = [found.replace(velocity=torch.tensor([[16.0, 0]], dtype=torch.float64)) for found in drive]
+    ids = {}
+    for name, sequence in (("told", told), ("not told", drive)):
+        tracker = KalmanConfidence(SPEC, frame_time=0.5)
+        state, ids[name] = tracker.start(), set()
+        for index, found in enumerate(sequence):
+            frame = FrameResult(FrameMeta(str(index), "s", index, index / 2))
+            tracker.step(state, frame, found)
+            ids[name] |= set(state.id.tolist())
+    assert ids["told"] == {1}
+    assert len(ids["not told"]) > 1
+
+
 def test_weak_detections_do_not_take_the_track_of_strong_ones() -> None:
     strong = boxes([(20, 0, 0)], 0.9)
     both = Boxes.cat([boxes([(20.1, 0, 0)], 0.2), boxes([(20.4, 0, 0)], 0.9)]).replace(batch=torch.zeros(2).long())
