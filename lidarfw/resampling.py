@@ -97,6 +97,7 @@ class FrameRecord:
             "by_frame": _columns(alone),
             "by_sequence": {name: _columns([found]) for name, found in self.by_sequence().items()},
             "block": block,
+            "blocks": len(blocks(self.frames, block)),
             "resampled": _columns(self.resampled(count, block)),
         }
 

@@ -42,7 +42,10 @@ def run(args: argparse.Namespace) -> int:
     record = FrameRecord() if args.frames else None
     figures = evaluate(Path(args.checkpoint), args.overrides, record)
     detail = record.to_plain(args.resamples, args.block) if record else {}
-    print(table(figures, detail.get("resampled", {})))
+    alone = detail.get("blocks", 0) == 1
+    print(table(figures, {} if alone else detail.get("resampled", {})))
+    if alone:
+        print(f"no intervals: all frames are one block of {args.block}.\n  fix: a smaller --block")
     if args.json:
         plain = {name: value if math.isfinite(value) else None for name, value in figures.items()}
         write_text(args.json, json.dumps(plain, indent=1) + "\n")

@@ -132,6 +132,14 @@ def test_eval_writes_figures_of_frames_and_prints_intervals(trained, tmp_path, c
     assert low <= found["figures"]["toy/accuracy"] <= high
 
 
+def test_one_block_gives_no_intervals(trained, tmp_path, capsys):
+    command = ["eval", str(trained), "dataset.toy.frames=4", "--frames", str(tmp_path / "f.json"), "--resamples", "5"]
+    assert main(command) == 0
+    printed = capsys.readouterr().out
+    assert "no intervals: all frames are one block of 10" in printed
+    assert "[" not in printed
+
+
 def test_eval_refuses_blocks_of_nothing(trained, tmp_path, capsys):
     assert main(["eval", str(trained), "--frames", str(tmp_path / "f.json"), "--block", "0"]) == 2
     assert "--block must be at least 1" in capsys.readouterr().err
