@@ -17,6 +17,7 @@ from lidarfw.types import Boxes, FrameMeta, FrameResult, Poses, Spec, Tracks
 
 from lidarfw_time3d.ab3dmot import AB3DMOT
 from lidarfw_time3d.assignment import gated_hungarian, greedy, hungarian
+from lidarfw_time3d.bench import measure
 from lidarfw_time3d.confidence import FEATURES, Confidence, log_odds
 from lidarfw_time3d.kalman import Motion, Noise
 from lidarfw_time3d.kalman_confidence import KalmanConfidence, KalmanConfidenceState
@@ -299,3 +300,11 @@ def test_the_state_stays_small_over_many_frames() -> None:
         sizes.append(len(state.id))
     assert state.next_id > 20
     assert max(sizes) < 15
+
+
+def test_the_bench_measures_every_tracker() -> None:
+    for name in ("kalman_confidence", "ab3dmot", "time3d_small"):
+        spent, held = measure(name, 4, 12)
+        assert len(spent) == 6
+        assert len(held) == 12
+        assert min(spent) > 0
