@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,19 +23,28 @@ if TYPE_CHECKING:
 
 _TABLE = (5, 25, 50, 75, 95)  # percentiles
 _MOVING = (252, 259)  # first and last of SemanticKITTI's moving classes
+_GROUPS = {
+    "road": (40, 60), "parking": (44,), "pavement": (48,), "terrain": (49, 72), "building": (50,), "fence": (51,),
+    "vegetation": (70, 71), "pole, sign": (80, 81), "vehicle": (10, 13, 18, 20, 252, 256, 257, 258, 259),
+    "person": (11, 15, 30, 31, 32, 253, 254, 255), "other": (0, 1, 52, 99),
+}  # fmt: skip
+_DISTANCES = np.array([4, 8, 12, 17, 23, 30, 40, 55, 75])  # metres between which the points on cars are counted
+_REAL, _TOWN = "#111111", "#D55E00"
 
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Of whole scans: points a scan (S,), ranges (P,) in metres, remission (P,), share of moving points.
+    """Of whole scans: points a scan (S,), ranges (P,) in metres, remission (P,), moving points (S,), groups.
 
-    Of labelled cars in the camera's view that nothing hides: distance (C,), points (C,), and size (C, 3) l, w, h.
+    `moving` are shares of the points of a scan, `groups` those of all points by class. Of labelled cars in the
+    camera's view that nothing hides: distance (C,), points (C,), and size (C, 3) l, w, h.
     """
 
     counts: Array
     ranges: Array
     remission: Array
-    moving: float
+    moving: Array
+    groups: dict[str, float]
     car_distance: Array
     car_points: Array
     car_size: Array
@@ -47,14 +56,25 @@ class Statistics:
             ("points a scan", f"{self.counts.mean():.0f}"),
             ("range, percentiles 5 25 50 75 95 (m)", _percentiles(self.ranges, 1)),
             ("remission, percentiles 5 25 50 75 95", _percentiles(self.remission, 2)),
-            ("moving points (%)", f"{100 * self.moving:.2f}"),
-            ("points on an unoccluded car at 10-20 m, median", f"{np.median(self.car_points[near]):.0f}"),
-            ("mean length, width, height of cars (m)", " ".join(f"{v:.2f}" for v in self.car_size.mean(0))),
+            ("points without remission (%)", f"{100 * (self.remission == 0).mean():.1f}"),
+            ("moving points (%)", f"{100 * np.average(self.moving, weights=self.counts):.2f}"),
+            ("points on an unoccluded car at 10-20 m, median", f"{_median(self.car_points[near]):.0f}"),
+            ("length, width, height of cars, mean (m)", _list(self.car_size, np.mean)),
+            ("length, width, height of cars, deviation (m)", _list(self.car_size, np.std)),
+            *((f"{name} (%)", f"{100 * share:.1f}") for name, share in self.groups.items()),
         ]
 
 
 def _percentiles(values: Array, digits: int) -> str:
     return " ".join(f"{value:.{digits}f}" for value in np.percentile(values, _TABLE))
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _list(table: Array, what: Callable[[Array], float]) -> str:
+    return " ".join(f"{what(column):.2f}" for column in table.T) if len(table) else "-"
 
 
 def collect(objects: str | Path, sequences: str | Path) -> Statistics:
@@ -64,12 +84,14 @@ def collect(objects: str | Path, sequences: str | Path) -> Statistics:
         raise DataError(f"{sequences}: no scans in dataset/sequences/*/velodyne")
     tables = [np.fromfile(path, "<f4").reshape(-1, 4) for path in scans]
     labels = [np.fromfile(p.parents[1] / "labels" / f"{p.stem}.label", "<u4") & 0xFFFF for p in scans]
-    label, points = np.concatenate(labels), np.concatenate(tables).astype(np.float64)
-    moving = float(((label >= _MOVING[0]) & (label <= _MOVING[1])).mean())
+    points = np.concatenate(tables).astype(np.float64)
+    moving = np.array([((label >= _MOVING[0]) & (label <= _MOVING[1])).mean() for label in labels])
+    label = np.concatenate(labels)
+    groups = {name: float(np.isin(label, ids).mean()) for name, ids in _GROUPS.items()}
     cars = _cars(str(objects))
     ranges = np.linalg.norm(points[:, :3], axis=1)
     counts = np.array([len(table) for table in tables], float)
-    return Statistics(counts, ranges, points[:, 3], moving, cars[:, 0], cars[:, 1], cars[:, 2:])
+    return Statistics(counts, ranges, points[:, 3], moving, groups, cars[:, 0], cars[:, 1], cars[:, 2:])
 
 
 def _cars(root: str) -> Array:
@@ -92,42 +114,72 @@ def _cars(root: str) -> Array:
 
 
 def draw(path: str | Path, town: Statistics, real: Statistics) -> None:
-    """Histograms of both as one PNG."""
+    """Curves of both as one PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure((13, 7.5), dpi=100, facecolor="white", layout="constrained")
+    figure = Figure((15, 10), dpi=90, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 3)
-    most = float(max(town.counts.max(), real.counts.max())) / 1000
-    _histogram(
-        axes[0, 0], town.counts / 1000, real.counts / 1000, np.linspace(0, most * 1.05, 61), "points a scan (1000)"
-    )
-    _histogram(axes[0, 1], town.ranges, real.ranges, np.linspace(0, 85, 86), "range (m)")
-    _histogram(axes[0, 2], town.remission, real.remission, np.linspace(0, 1, 51), "remission")
+    axes = figure.subplots(3, 3)
+    _curves(axes[0, 0], town.counts / 1e3, real.counts / 1e3, np.linspace(100, 132, 33), "points a scan (thousands)")
+    _curves(axes[0, 1], town.ranges, real.ranges, np.linspace(0, 85, 86), "range (m)")
+    _curves(axes[0, 2], town.remission, real.remission, np.linspace(0, 1, 51), "remission")
     _against_distance(axes[1, 0], town, real)
-    _histogram(axes[1, 1], town.car_size[:, 0], real.car_size[:, 0], np.linspace(2.8, 5.5, 19), "length of cars (m)")
-    _histogram(axes[1, 2], town.car_size[:, 2], real.car_size[:, 2], np.linspace(1.2, 2.1, 19), "height of cars (m)")
+    _cumulative(axes[1, 1], town.moving * 100, real.moving * 100, "moving points of a scan (%), cumulative")
+    _shares(axes[1, 2], town, real)
+    spans = ((2.8, 5.5, "length"), (1.3, 2.1, "width"), (1.2, 2.1, "height"))
+    for column, (low, high, name) in enumerate(spans):
+        edges = np.linspace(low, high, 19)
+        ours, theirs = town.car_size[:, column], real.car_size[:, column]
+        _curves(axes[2, column], ours, theirs, edges, f"{name} of cars (m)")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
 
 
-def _histogram(axes: Axes, town: Array, real: Array, edges: Array, title: str) -> None:
-    for values, name, colour in ((real, "real", "#111111"), (town, "town", "#D55E00")):
-        axes.hist(values, edges.tolist(), density=True, histtype="step", linewidth=1.6, color=colour, label=name)
+def _finish(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False)
+
+
+def _curves(axes: Axes, town: Array, real: Array, edges: Array, title: str) -> None:
+    for values, name, colour in ((real, "real", _REAL), (town, "town", _TOWN)):
+        if len(values):
+            bins = edges.tolist()
+            axes.hist(values, bins, density=True, histtype="step", linewidth=1.6, color=colour, label=name)
     axes.set_yticks([])
-    axes.legend()
+    _finish(axes, title)
+
+
+def _cumulative(axes: Axes, town: Array, real: Array, title: str) -> None:
+    for values, name, colour in ((real, "real", _REAL), (town, "town", _TOWN)):
+        axes.step(np.sort(values), np.linspace(0, 1, len(values)), where="post", color=colour, label=name)
+    _finish(axes, title)
 
 
 def _against_distance(axes: Axes, town: Statistics, real: Statistics) -> None:
-    for one, name, colour in ((town, "town", "#D55E00"), (real, "real", "#111111")):
-        axes.scatter(
-            one.car_distance, np.maximum(one.car_points, 0.7), s=12, color=colour, alpha=0.6, linewidths=0, label=name
-        )
-    axes.set(yscale="log", xlabel="distance (m)")
-    axes.set_title("points on unoccluded cars", loc="left")
-    axes.legend()
+    """Median and quartiles of the points on cars, by distance."""
+    for one, name, colour in ((real, "real", _REAL), (town, "town", _TOWN)):
+        which = np.digitize(one.car_distance, _DISTANCES)
+        bins = [number for number in range(1, len(_DISTANCES)) if (which == number).sum() >= 2]
+        if not bins:
+            continue
+        middle = [float(np.median(one.car_distance[which == number])) for number in bins]
+        low, half, high = np.array([np.percentile(one.car_points[which == b], (25, 50, 75)) for b in bins]).T
+        axes.plot(middle, np.maximum(half, 0.7), "o-", color=colour, label=name)
+        axes.fill_between(middle, np.maximum(low, 0.7), np.maximum(high, 0.7), color=colour, alpha=0.18, linewidth=0)
+    axes.set_yscale("symlog")
+    axes.set_xlabel("distance (m)")
+    _finish(axes, "points on unoccluded cars, median and quartiles")
+
+
+def _shares(axes: Axes, town: Statistics, real: Statistics) -> None:
+    place = np.arange(len(_GROUPS))[::-1]
+    for one, name, colour, shift in ((real, "real", _REAL, 0.2), (town, "town", _TOWN, -0.2)):
+        shares = [100 * one.groups[group] for group in _GROUPS]
+        axes.barh(place + shift, shares, height=0.38, color=colour, label=name)
+    axes.set_yticks(place.tolist(), list(_GROUPS))
+    _finish(axes, "points by class (%)")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -208,7 +208,7 @@ def test_statistics_of_two_folders_make_a_figure(
     arguments = [word for pair in zip(folders, values) for word in pair]
     assert statistics.main([*arguments, "--out", str(tmp_path / "figure.png")]) == 0
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()]
-    assert len(rows) == 6
+    assert len(rows) == 19
     assert all(ours == theirs.removesuffix(" |") for _, ours, theirs in rows)
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
