@@ -16,6 +16,7 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 from lightning.pytorch.utilities import rank_zero_warn
+from scipy.spatial import KDTree
 from torch.utils.data import DataLoader, get_worker_info
 
 from lidarfw.errors import CheckpointError, ConfigError, DataError, LidarfwError
@@ -182,6 +183,43 @@ class BatchOrder:
             yield [(self.epoch, number) for number in numbers[first : first + self.batch_size]]
 
 
+class PairOrder(BatchOrder):
+    """Batches of pairs of frames that were taken less than `radius` metres apart, for losses between places.
+
+    An epoch has half as many pairs as there are frames with a partner: each draws another first frame and any one of
+    the frames near to it. ConfigError where no frame has a partner.
+    """
+
+    def __init__(
+        self, positions: np.ndarray, radius: float, batch_size: int, *, seed: int, rank: int = 0, world: int = 1
+    ) -> None:
+        self.tree, self.radius = KDTree(positions[:, :2]), radius
+        near = self.tree.query_ball_point(positions[:, :2], radius, return_length=True)
+        self.paired = np.flatnonzero(near > 1)
+        if not len(self.paired):
+            raise ConfigError(f"loader.pairs is {radius} m, and no two frames were taken so near to each other")
+        super().__init__(2 * -(-len(self.paired) // 2), batch_size, seed=seed, shuffle=True, rank=rank, world=world)
+
+    def _share(self) -> int:
+        return 2 * -(-(self.clips // 2) // self.world)
+
+    def numbers(self) -> list[int]:
+        """Frame numbers of this rank in the order of the epoch, partners beside each other."""
+        draw = np.random.default_rng((self.seed, self.epoch))
+        first = draw.permutation(self.paired)[: self.clips // 2]
+        near = self.tree.query_ball_point(self.tree.data[first], self.radius, return_sorted=True)
+        chances = draw.random(len(first))
+        pairs = np.array([(a, _other(a, many, chance)) for a, many, chance in zip(first, near, chances, strict=True)])
+        padded = np.resize(pairs, (self._share() // 2 * self.world, 2))
+        return [int(number) for number in padded[self.rank :: self.world].ravel()]
+
+
+def _other(frame: int, near: Sequence[int], chance: float) -> int:
+    """One of the frames near to a frame, but not itself; `chance` 0..1 says which."""
+    others = [number for number in near if number != frame]
+    return others[int(chance * len(others))]
+
+
 class FrameLoader(DataLoader[Batch]):
     """A DataLoader that goes on in the middle of an epoch, names the frames that fail, and never waits for ever."""
 
@@ -293,7 +331,7 @@ def clips_of(dataset: Dataset, length: int) -> list[Sequence[int]]:
 
 
 class DataModule(pl.LightningDataModule):
-    """The one data module: training in shuffled clips, evaluation in order of time.
+    """The one data module: training in shuffled clips (or pairs of frames), evaluation in order of time.
 
     `datasets` and `transforms` are by stage: train, val, test; a stage may be missing. With `streams`, evaluation
     keeps every sequence on one rank, for filters and trackers; else the ranks get equal runs of frames.
@@ -308,6 +346,7 @@ class DataModule(pl.LightningDataModule):
         batch_size: int = 2,
         workers: int = 0,
         clip: int = 1,
+        pairs: float = 0.0,
         timeout: float = 120,
         bad_sample: str = "error",
         streams: bool = True,
@@ -319,6 +358,9 @@ class DataModule(pl.LightningDataModule):
         self.batch_size = _at_least("loader.batch_size", batch_size, 1)
         self.workers = _at_least("loader.workers", workers, 0)
         self.clip = _at_least("loader.clip", clip, 1)
+        self.pairs = _at_least("loader.pairs", pairs, 0)
+        if self.pairs and (self.clip > 1 or self.batch_size % 2):
+            raise ConfigError("loader.pairs needs an even loader.batch_size and loader.clip=1")
         self.timeout = _at_least("loader.timeout", timeout, 1)
         if bad_sample not in BAD_SAMPLE_POLICIES:
             raise ConfigError(f"loader.bad_sample is {bad_sample!r}; use one of: {', '.join(BAD_SAMPLE_POLICIES)}")
@@ -358,15 +400,27 @@ class DataModule(pl.LightningDataModule):
         if not clips:
             longest = max((len(s) for s in dataset.sequences()), default=0)
             raise ConfigError(f"loader.clip is {self.clip}, but the longest sequence has {longest} frames")
-        shuffle = not getattr(self.trainer, "overfit_batches", 0)
-        order = BatchOrder(
-            len(clips), self.batch_size, seed=self.seed, shuffle=shuffle, rank=self.rank, world=self.world
-        )
+        order = self._pair_order(dataset) if self.pairs else self._clip_order(len(clips))
         loader = self._loader(Clips(dataset, self.transforms["train"], clips, self.seed, replace=self.skip), order)
         if self._resume is not None:
             loader.load_state_dict(self._resume)
         self._resume, self._train_loader = None, loader
         return loader
+
+    def _clip_order(self, clips: int) -> BatchOrder:
+        shuffle = not getattr(self.trainer, "overfit_batches", 0)
+        return BatchOrder(clips, self.batch_size, seed=self.seed, shuffle=shuffle, rank=self.rank, world=self.world)
+
+    def _pair_order(self, dataset: Dataset) -> BatchOrder:
+        positions = dataset.positions()
+        if positions is None:
+            name = type(dataset).__name__
+            raise ConfigError(f"loader.pairs needs poses, and {name} gives none.\n  fix: loader.pairs=0, or its poses")
+        # numbers are those of clips, which go through the sequences one by one
+        order = np.concatenate([np.asarray(sequence) for sequence in dataset.sequences()])
+        return PairOrder(
+            positions[order], self.pairs, self.batch_size, seed=self.seed, rank=self.rank, world=self.world
+        )
 
     def failure(self, error: RuntimeError) -> DataError | None:
         """What an error means that torch raised in the midst of other work, because a training worker died."""

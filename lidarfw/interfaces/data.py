@@ -40,6 +40,10 @@ class Dataset(ABC):
         """Frame numbers of each sequence in order of time. Default: all frames are one sequence."""
         return [range(len(self))]
 
+    def positions(self) -> np.ndarray | None:
+        """Where each frame was taken, (N, 3) metres in the map, without reading sensor data; None where not known."""
+        return None
+
 
 class Transform(ABC):
     """Changes a frame on a CPU worker: augmentation, or another representation of the data.

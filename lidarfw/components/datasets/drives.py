@@ -101,6 +101,11 @@ class DriveDataset(Dataset):
         """The frames of each drive."""
         return [range(start, end) for start, end in zip(self._starts[:-1].tolist(), self._starts[1:].tolist())]
 
+    def positions(self) -> Array | None:
+        """Where each frame was taken, (N, 3) metres in the map; None where a drive has no poses."""
+        poses = [drive.poses for drive in self.drives if drive.poses is not None]
+        return np.concatenate(poses)[:, :3, 3] if len(poses) == len(self.drives) else None
+
     def recent(self, place: int) -> list[int]:
         """Places of the scans of a frame: its own first, then the past ones; fewer at the start of a sequence."""
         return list(range(place, max(-1, place - self.sweeps), -1))

@@ -149,7 +149,7 @@ def test_fusion_by_concatenation_tells_apart_what_a_sum_does_not() -> None:
 
 def test_weights_of_branches_and_branches_left_out() -> None:
     weights = {"i": 2.0, "d": 1.0, "s": 1.0}
-    (fused(QUERY, fusion="weighted", weights=weights) - fused(SWAPPED, fusion="weighted", weights=weights)).norm()
+    one, other = (fused(branches, fusion="weighted", weights=weights) for branches in (QUERY, SWAPPED))
     assert float((one - other).norm()) == pytest.approx(math.sqrt((4 * 2 + 1 * 2) / 6))
     two = {name: QUERY[name] for name in ("i", "s")}
     assert fused(two).tolist() == pytest.approx([HALF, 0, 0.5, 0.5])
