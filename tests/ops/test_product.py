@@ -21,7 +21,7 @@ def operands(rows: int, inputs: int = 64, outputs: int = 64) -> tuple[torch.Tens
     return buffer, torch.randn(inputs, outputs, generator=random)
 
 
-@pytest.mark.parametrize("rows", [0, 1, 255, 256, 257, 4096, 9000])
+@pytest.mark.parametrize("rows", [0, 1, 511, 512, 513, 4096, 9000])
 @pytest.mark.parametrize("channels", [(4, 16), (32, 64), (64, 64), (64, 128), (128, 256)])
 def test_product_equals_that_of_float64_whatever_lies_behind_the_rows(library, rows, channels) -> None:
     buffer, weight = operands(rows, *channels)
