@@ -498,16 +498,16 @@ def range_labels(
     colours = np.array([_rgb(colour) for colour in [*names, _BY_NAME["static"]]])[label]
     grey = (label < 0) | np.isin(label, [n for n, name in enumerate(classes) if name == "static"])
     shade = np.where(grey, near, 0.4 + 0.6 * near) * (near > 0)
-    return (colours * shade[:, None]).astype(np.uint8).reshape(height, width, 3).repeat(scale, 0)
+    picture: Picture = (colours * shade[:, None]).astype(np.uint8).reshape(height, width, 3).repeat(scale, 0)
+    return picture
 
 
 def side_by_side(pictures: Sequence[Picture], columns: int, width: int) -> Picture:
     """Pictures in rows of `columns`, each scaled to `width` pixels, with white between them."""
     import cv2
 
-    scaled = [
-        cv2.resize(p, (width, round(p.shape[0] * width / p.shape[1])), interpolation=cv2.INTER_AREA) for p in pictures
-    ]
+    sizes = [(width, round(p.shape[0] * width / p.shape[1])) for p in pictures]
+    scaled: list[Any] = [cv2.resize(p, size, interpolation=cv2.INTER_AREA) for p, size in zip(pictures, sizes)]
     rows = [scaled[first : first + columns] for first in range(0, len(scaled), columns)]
     return np.concatenate([_row_of(row, columns, width) for row in rows])
 

@@ -15,8 +15,9 @@ import torch
 
 from lidarfw.assembly import make_transforms, transform_names
 from lidarfw.components.datasets.drives import Drive, merge_scans, pose_of
-from lidarfw.latency import clocks, memory, now, street_scan
+from lidarfw.latency import clocks, memory, now
 from lidarfw.model import PerceptionModel
+from lidarfw.ops.inputs import street_scan
 from lidarfw.streaming import Stream
 from lidarfw.types import Frame, FrameMeta, FrameResult, Points, Poses, Targets, collate
 
@@ -56,7 +57,8 @@ def simulated_drive(model: PerceptionModel, count: int, scan: Points | None = No
     """
     spec = model.plan.data
     scan = street_scan(half_view=math.pi) if scan is None else scan
-    drive = Drive("street", [Path("street")] * count, np.arange(count) * 0.1, _straight_ahead(count))
+    times = np.arange(count, dtype=np.float64) * 0.1
+    drive = Drive("street", [Path("street")] * count, times, _straight_ahead(count))
     for place in range(count):
         places = list(range(place, max(-1, place - spec.sweeps), -1))
         inputs: dict[str, Any] = {}
