@@ -229,6 +229,12 @@ class RandomHeading(Transform):
         return Frame({name: turned(value, angle) for name, value in frame.inputs.items()}, frame.targets, frame.meta)
 
 
+class AnyHeading(RandomHeading):
+    """The same in evaluation too, to see whether a descriptor knows a place from any side."""
+
+    train_only = False
+
+
 def turned(value: Any, angle: float) -> Any:
     """A panorama or bird's-eye view after the vehicle has turned right by `angle` radians; others stay as they are."""
     if isinstance(value, Image) and value.cameras[0].model == "equirectangular":
