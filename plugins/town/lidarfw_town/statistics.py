@@ -144,9 +144,9 @@ def _finish(axes: Axes, title: str) -> None:
 
 def _curves(axes: Axes, town: Array, real: Array, edges: Array, title: str) -> None:
     for values, name, colour in ((real, "real", _REAL), (town, "town", _TOWN)):
+        values = values[(values >= edges[0]) & (values <= edges[-1])]
         if len(values):
-            bins = edges.tolist()
-            axes.hist(values, bins, density=True, histtype="step", linewidth=1.6, color=colour, label=name)
+            axes.hist(values, edges.tolist(), density=True, histtype="step", linewidth=1.6, color=colour, label=name)
     axes.set_yticks([])
     _finish(axes, title)
 
