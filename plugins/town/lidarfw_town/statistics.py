@@ -139,7 +139,8 @@ def draw(path: str | Path, town: Statistics, real: Statistics) -> None:
 def _finish(axes: Axes, title: str) -> None:
     axes.set_title(title, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(frameon=False)
 
 
 def _curves(axes: Axes, town: Array, real: Array, edges: Array, title: str) -> None:
