@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from lidarfw import interfaces, registry
-from lidarfw.errors import RegistryError
+from lidarfw.errors import ConfigError, RegistryError
 from lidarfw.interfaces import SLOTS
 from lidarfw.testing.checks import data, declared, forward, loss, retriever, stream
 from lidarfw.testing.checks.packaging import PACKAGE_CHECKS, entries
@@ -54,6 +54,8 @@ class Case:
         except FailedError as error:
             return CheckResult(self.component, self.check, "failed", str(error))
         except Exception as error:
+            if isinstance(error, ConfigError) and isinstance(error.__cause__, ImportError):  # an optional library
+                return CheckResult(self.component, self.check, "skipped", str(error))
             return CheckResult(self.component, self.check, "failed", f"{type(error).__name__}: {error}{_place(error)}")
         return CheckResult(self.component, self.check, "passed")
 

@@ -10,7 +10,7 @@ Loss and Large Batch Training" (MinkLoc3Dv2), ICPR 2022.
 from __future__ import annotations
 
 import torch
-from lidarfw.errors import ConfigError, DataError
+from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Loss
 from lidarfw.types import Targets
 from torch import Tensor
@@ -32,13 +32,14 @@ def _squares(vector: Tensor) -> Tensor:
     return length[:, None] + length - 2 * vector @ vector.T
 
 
-def neighbours(targets: Targets, positive: float, negative: float) -> tuple[Tensor, Tensor]:
+def neighbours(output: PlaceOutput, targets: Targets, positive: float, negative: float) -> tuple[Tensor, Tensor]:
     """Which frames (B, B) show the same place, and which another one; a frame is neither to itself.
 
-    DataError where the frames have no poses.
+    Of frames without a pose neither is known.
     """
     if targets.poses is None:
-        raise DataError("a loss on places needs the pose of every frame of the batch, and one has none")
+        unknown = torch.zeros(len(output.vector), len(output.vector), dtype=torch.bool, device=output.vector.device)
+        return unknown, unknown
     place = targets.poses.matrix[:, :2, 3].double()
     metres = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
     known = targets.poses.ok[:, None] & targets.poses.ok
@@ -118,7 +119,7 @@ class TSAPLoss(_PlaceLoss):
 
     def forward(self, output: PlaceOutput, targets: Targets) -> dict[str, Tensor]:
         """The term `tsap`, 0..1."""
-        masks = neighbours(targets, self.positive, self.negative)
+        masks = neighbours(output, targets, self.positive, self.negative)
         distance = pairwise_distance(output.vector)
         precision, asked = smooth_average_precision(distance, *masks, k=self.k, tau=self.tau, numerator=self.numerator)
         lost = torch.where(asked, 1 - precision, 0 * precision)
@@ -135,7 +136,7 @@ class TripletLoss(_PlaceLoss):
 
     def forward(self, output: PlaceOutput, targets: Targets) -> dict[str, Tensor]:
         """The term `triplet`; the mean over queries with a positive and a negative."""
-        positive, negative = neighbours(targets, self.positive, self.negative)
+        positive, negative = neighbours(output, targets, self.positive, self.negative)
         distance = pairwise_distance(output.vector)
         asked = positive.any(1) & negative.any(1)
         farthest = distance.masked_fill(~positive, -torch.inf).amax(1)
@@ -156,7 +157,7 @@ class InfoNCELoss(_PlaceLoss):
 
     def forward(self, output: PlaceOutput, targets: Targets) -> dict[str, Tensor]:
         """The term `info_nce`; the mean over all positive pairs."""
-        positive, negative = neighbours(targets, self.positive, self.negative)
+        positive, negative = neighbours(output, targets, self.positive, self.negative)
         similar = output.vector @ output.vector.T / self.temperature
         others = similar.masked_fill(~negative, -1e4).logsumexp(1, keepdim=True)
         lost = F.softplus(others - similar)  # -log(e^s / (e^s + sum over negatives of e^n))

@@ -9,7 +9,7 @@ from lidarfw.types import Poses, Targets
 from torch import Tensor
 
 from lidarfw_crossplace.heads import PlaceOutput
-from lidarfw_crossplace.losses import InfoNCELoss, TripletLoss, TSAPLoss, smooth_average_precision
+from lidarfw_crossplace.losses import InfoNCELoss, TripletLoss, TSAPLoss, neighbours, smooth_average_precision
 
 LOSSES = (TSAPLoss(), TripletLoss(), InfoNCELoss())
 
@@ -111,14 +111,9 @@ def test_large_batches_measure_distances_as_small_ones_do() -> None:
     torch.manual_seed(0)
     vector = torch.nn.functional.normalize(torch.randn(65, 8, dtype=torch.float64), dim=1)
     targets = at(*(60.0 * (i // 3) for i in range(65)))
-    whole = smooth_average_precision(torch.cdist(vector, vector), *_masks(targets))[0].mean()
+    masks = neighbours(output(vector), targets, 10, 50)
+    whole = smooth_average_precision(torch.cdist(vector, vector), *masks)[0].mean()
     assert float(1 - whole) == pytest.approx(float(value(TSAPLoss(), vector, targets)), abs=1e-5)
-
-
-def _masks(targets: Targets) -> tuple[Tensor, Tensor]:
-    from lidarfw_crossplace.losses import neighbours
-
-    return neighbours(targets, 10, 50)
 
 
 def test_wrong_options_are_named() -> None:
