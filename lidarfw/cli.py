@@ -1,4 +1,4 @@
-"""The command line: `lidarfw train|eval|predict|track|list|show|check|new|prepare|bench|claims|completion`."""
+"""The command line: `lidarfw train|eval|predict|track|index|list|show|check|new|prepare|bench|claims|completion`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ COMMANDS = {
     "eval": "measure a checkpoint on a dataset",
     "predict": "run a checkpoint on scans or images and write results and pictures",
     "track": "follow the boxes of any detector through a sequence and write the official result files",
+    "index": "maps of place descriptors: build, search, judge",
     "list": "what is installed, by slot",
     "show": "how components would be wired, and how large the model is",
     "check": "test a plugin or component against the rules of its interface",

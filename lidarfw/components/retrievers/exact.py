@@ -37,6 +37,17 @@ class ExactRetriever(Retriever):
         time = torch.full((len(vector),), torch.nan, dtype=torch.float64, device=vector.device)
         return Index(vector, poses.matrix, time, descriptors.modality)
 
+    def add(self, index: Index, descriptors: Descriptors, poses: Poses) -> Index:
+        """The index with more places behind those it has; the modality is kept where both have it."""
+        rows = self.build(descriptors, poses)
+        if len(index) and rows.vector.shape[1] != index.vector.shape[1]:
+            raise ConfigError(
+                f"the map has {index.vector.shape[1]} numbers a place, the new ones {rows.vector.shape[1]}"
+            )
+        whole = [torch.cat([getattr(part, name) for part in (index, rows)]) for name in ("vector", "pose", "time")]
+        named = len(index.modality) == len(index) and len(rows.modality) == len(rows)
+        return Index(*whole, modality=(*index.modality, *rows.modality) if named else ())
+
     @torch.no_grad()
     def query(self, index: Index, descriptors: Descriptors, k: int) -> Matches:
         """The k nearest places of each descriptor; where the map has fewer, index -1 and distance inf fill up."""

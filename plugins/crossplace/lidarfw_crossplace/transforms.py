@@ -84,10 +84,11 @@ class Panorama(Transform):
 
     def spec(self, data: DataSpec) -> DataSpec:
         """The panoramas instead of what the sensors gave. ConfigError where an input is missing."""
-        kinds = {"depth": "_depth", "semantics": "_semantics"}
-        needed = [f"{name}{kinds[kind]}" for kind in kinds if kind in self.maps for name in self.cameras]
-        missing = [name for name in ("points", *self.cameras, *needed) if name not in data.inputs]
-        if len(missing) == len(self.cameras) + len(needed) + 1 or (set(missing) & set(needed)):
+        kinds = [""] + [f"_{kind}" for kind in ("depth", "semantics") if kind in self.maps]
+        pictures = [f"{name}{kind}" for name in self.cameras for kind in kinds]
+        seeing = any(name in data.inputs for name in self.cameras)
+        missing = [name for name in pictures if name not in data.inputs]
+        if missing and (seeing or "points" not in data.inputs):
             raise ConfigError(
                 f"transform 'panorama' needs the input {missing[0]}; there are {', '.join(data.inputs)}\n"
                 "  fix: give depth and semantics by the dataset, or transform.panorama.maps=[intensity]"

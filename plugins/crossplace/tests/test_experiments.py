@@ -1,0 +1,103 @@
+"""From training to a searchable map, by the commands a user types."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lidarfw.cli import main
+from lidarfw.data import PairOrder
+from lidarfw.errors import ConfigError, DataError
+
+from lidarfw_crossplace.datasets import BEVPlaceDataset, EitherSensor
+
+
+def drive(folder: Path, count: int = 48, size: int = 31) -> Path:
+    """A round of which the second half is the first once more, with pictures that depend on the place."""
+    places = np.arange(count) % (count // 2)
+    rng = np.random.default_rng(0)
+    scene = rng.integers(0, 255, (count // 2, size, size))
+    noise = rng.integers(0, 20, (count, size, size))
+    pose = np.tile(np.eye(4)[:3], (count, 1, 1))
+    pose[:, 0, 3] = 10.0 * places
+    np.savez(folder / "00.npz", bev=(scene[places] * 0.9 + noise).clip(0, 255).astype(np.uint8), pose=pose)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("bev")
+    drive(folder)
+    options = (
+        f"experiment=place_bev dataset.bev_place.root={folder} dataset.bev_place.size=31 splits.train=00 splits.val=00 "
+        "head.place_bev.channels=16 head.place_bev.rings=3 loader.batch_size=16 trainer.max_epochs=2 "
+        "trainer.check_val_every_n_epoch=2 metric.recall_at.gap=1 logger=none trainer.enable_progress_bar=false "
+        f"trainer.accelerator=cpu hydra.run.dir={folder}/run"
+    )
+    assert main(["train", *options.split()]) == 0
+    return folder, next(folder.glob("run/checkpoints/last*.ckpt"))
+
+
+def test_place_bev_trains_and_its_map_is_searched(trained: tuple[Path, Path], tmp_path: Path) -> None:
+    _folder, checkpoint = trained
+    places = tmp_path / "map.npz"
+    build = ["index", "build", str(checkpoint), "--split", "val", "-o", str(places)]
+    assert main(build) == 0
+    assert main([*build, "--add"]) == 0
+    assert main(["index", "eval", str(places), str(places), "--json", str(tmp_path / "figures.json")]) == 0
+    assert json.loads((tmp_path / "figures.json").read_text())["recall@1_5m"] == 1
+    found = tmp_path / "found.json"
+    query = ["index", "query", str(places), str(checkpoint), "--split", "val", "-k", "2", "--json", str(found)]
+    assert main(query) == 0
+    rows = json.loads(found.read_text())
+    assert len(rows) == 48
+    for number, row in enumerate(rows):
+        assert {match["place"] for match in row["matches"]} == {number, number + 48}
+        assert row["matches"][0]["distance"] < 1e-3
+        assert row["matches"][0]["modality"] == "lidar"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["-o", "map.txt", "--split", "val"], "-o map.npz"),
+        (["-o", "map.npz"], "scans or --split"),
+        (["-o", "map.npz", "--split", "val", "--option", "chunks=3"], "options of retriever 'exact': chunk"),
+    ],
+)
+def test_wrong_commands_are_answered(
+    trained: tuple[Path, Path], arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["index", "build", str(trained[1]), *arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_regions_of_a_drive(tmp_path: Path) -> None:
+    drive(tmp_path)
+    west, east = (BEVPlaceDataset(root=str(tmp_path), split=f"00:x{sign}100", size=31) for sign in "<>")
+    assert len(west) == 20
+    assert len(west) + len(east) == 48
+    assert max(west.positions()[:, 0]) < 100 <= min(east.positions()[:, 0])
+    assert (east.meta(0).index, east.meta(0).time) == (10, 1.0)
+    with pytest.raises(ConfigError, match="x<100"):
+        len(BEVPlaceDataset(root=str(tmp_path), split="00:z<1", size=31))
+    with pytest.raises(DataError, match="found \\(48, 31, 31\\)"):
+        len(BEVPlaceDataset(root=str(tmp_path), split="00"))
+
+
+def test_pairs_are_of_both_sensors_in_half_of_the_cases() -> None:
+    frames = EitherSensor(of="synthetic", options={"frames": 4, "image": True})
+    assert [frames.meta(i).modality for i in range(4)] == ["camera", "lidar"] * 2
+    assert frames[3].meta.id == frames.meta(3).id
+    assert [len(run) for run in frames.sequences()] == [8]
+    places = np.zeros((2000, 3))
+    places[:, 0] = np.arange(2000) // 2  # every place by both sensors
+    order = PairOrder(places, 5.0, 2, seed=0)
+    first, second = np.array(order.numbers()).reshape(-1, 2).T % 2
+    shares = [float(((first == a) & (second == b)).mean()) for a, b in ((0, 0), (1, 1))]
+    assert shares == pytest.approx([0.25, 0.25], abs=0.05)
+    assert (first != second).mean() == pytest.approx(0.5, abs=0.06)
+    with pytest.raises(ConfigError, match="do not fit 'synthetic'"):
+        EitherSensor(of="synthetic", options={"colour": 1})
