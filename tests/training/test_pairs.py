@@ -43,7 +43,7 @@ def test_processes_share_the_pairs() -> None:
 def test_what_makes_no_pairs_is_named() -> None:
     with pytest.raises(ConfigError, match="no two frames"):
         PairOrder(PLACES[[0, 2, 5]], 6.0, 4, seed=1)
-    with pytest.raises(ConfigError, match="even loader.batch_size"):
+    with pytest.raises(ConfigError, match=r"even loader\.batch_size"):
         DataModule({}, batch_size=3, pairs=10.0)
     module = DataModule({"train": SyntheticDataset(frames=4)}, pairs=10.0)
     with pytest.raises(ConfigError, match=r"(?s)SyntheticDataset gives none.*loader.pairs=0"):

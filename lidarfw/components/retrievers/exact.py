@@ -44,9 +44,11 @@ class ExactRetriever(Retriever):
             raise ConfigError(
                 f"the map has {index.vector.shape[1]} numbers a place, the new ones {rows.vector.shape[1]}"
             )
-        whole = [torch.cat([getattr(part, name) for part in (index, rows)]) for name in ("vector", "pose", "time")]
+        vector, pose, time = (
+            torch.cat([getattr(part, name) for part in (index, rows)]) for name in ("vector", "pose", "time")
+        )
         named = len(index.modality) == len(index) and len(rows.modality) == len(rows)
-        return Index(*whole, modality=(*index.modality, *rows.modality) if named else ())
+        return Index(vector, pose, time, (*index.modality, *rows.modality) if named else ())
 
     @torch.no_grad()
     def query(self, index: Index, descriptors: Descriptors, k: int) -> Matches:

@@ -57,6 +57,9 @@ class Trunk(nn.Module):
     MinkLoc3Dv2), so a batch of any size fits in memory. Batch normalisation then uses its running statistics.
     """
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, in_channels: int, network: str, chunk: int) -> None:
         super().__init__()
         self.chunk = chunk
@@ -94,7 +97,7 @@ class Trunk(nn.Module):
         return torch.cat([checkpoint(self._run, part, use_reentrant=False) for part in parts])
 
     def _run(self, features: Tensor) -> Tensor:
-        features = features.expand(-1, len(self.mean), -1, -1)  # type: ignore[arg-type]
+        features = features.expand(-1, len(self.mean), -1, -1)
         result: Tensor = self.stages(self.stem((features - self.mean) / self.std))
         return result
 

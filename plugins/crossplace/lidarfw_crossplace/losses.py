@@ -83,6 +83,8 @@ def _without_self(ahead: Tensor, counted: Tensor, nearest: Tensor) -> Tensor:
 class _PlaceLoss(Loss):
     """What the losses on places share: radii in metres."""
 
+    example: ClassVar[dict[str, Any]] = {"positive": 0.4, "negative": 0.5}  # metres, for frames of one drive
+
     def __init__(self, positive: float, negative: float) -> None:
         super().__init__()
         if not 0 < positive <= negative:

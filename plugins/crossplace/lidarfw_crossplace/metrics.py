@@ -109,7 +109,7 @@ class PlaceRecall(Metric):
             in_map = torch.isin(places[:, 0], places.new_tensor(self.map))
             return ~in_map, in_map
         queries = torch.zeros(len(places), dtype=torch.bool)
-        for key in places[:, [0, 4]].unique(dim=0):
+        for key in torch.unique(places[:, [0, 4]], dim=0):
             rows = (places[:, [0, 4]] == key).all(1).nonzero()[:, 0]
             rows = rows[places[rows, 1].argsort(stable=True)]
             queries[rows.cpu()] = spaced(places[rows, 2:4].cpu(), self.spacing)

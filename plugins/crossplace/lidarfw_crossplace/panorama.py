@@ -211,7 +211,7 @@ def fit_polynomial(
     terms = polynomial_terms(place, degree)
     if np.linalg.matrix_rank(terms) < terms.shape[1]:
         raise DataError(f"{len(place)} matches do not determine the {terms.shape[1]} coefficients of degree {degree}")
-    return np.linalg.lstsq(terms, target, rcond=None)[0]
+    return np.linalg.lstsq(terms, target, rcond=None)[0].astype(np.float64)
 
 
 def rig_of(cameras: Mapping[str, Camera], names: Sequence[str]) -> tuple[Camera, ...]:

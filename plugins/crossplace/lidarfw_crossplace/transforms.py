@@ -158,8 +158,9 @@ class Panorama(Transform):
     # the cameras
 
     def _camera_maps(self, frame: Frame, rng: np.random.Generator) -> dict[str, Tensor]:
-        makers = {"intensity": self._grey, "depth": self._depth, "semantics": self._semantics}
-        return {n: makers[n](frame) if n == "intensity" else makers[n](frame, rng) for n in self.maps}  # type: ignore[call-arg]
+        makers = {"intensity": lambda: self._grey(frame), "depth": lambda: self._depth(frame, rng),
+                  "semantics": lambda: self._semantics(frame, rng)}  # fmt: skip
+        return {name: makers[name]() for name in self.maps}
 
     def _pictures(self, frame: Frame, kind: str = "") -> tuple[panorama.Stitcher, list[Tensor]]:
         missing = [name for name in self.cameras if f"{name}{kind}" not in frame.inputs]
