@@ -9,6 +9,8 @@ Loss and Large Batch Training" (MinkLoc3Dv2), ICPR 2022.
 
 from __future__ import annotations
 
+from typing import Any, ClassVar
+
 import torch
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Loss
