@@ -102,14 +102,15 @@ class MSRMHead(Head):
         """Options.
 
         regions: proposals a sample, in training and after. pool: where features come from, voxels (of the levels
-        `strides`), points or bev; auto is voxels where the backbone gives any, else bev. neighbors: voxels or points
-        of each grid point. channels, heads, dropout: of the stage tokens and their attention. foreground: IoU of every
-        stage, by class name, over which a region learns a box.
+        `strides`), points or bev; auto is voxels where all these levels are there, else bev. neighbors: voxels or
+        points of each grid point. channels, heads, dropout: of the stage tokens and their attention. foreground: IoU of
+        every stage, by class name, over which a region learns a box.
         """
         super().__init__()
         _check(stages, regions, channels, heads, pool)
         self.regions, self.strides = regions, tuple(strides)
-        self.pool = pool if pool != "auto" else ("voxels" if voxels else "bev")
+        there = {spec.stride for spec in voxels or []}
+        self.pool = pool if pool != "auto" else ("voxels" if there.issuperset(strides) else "bev")
         self.pooling = self._pooling(voxels, points, bev, grid, neighbors)
         width = self.pooling.channels
         self.encoders = nn.ModuleList(StageEncoder(width, channels, dropout) for _ in range(stages))
