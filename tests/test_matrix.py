@@ -88,7 +88,7 @@ def test_a_valid_combination_trains_and_decodes(
     assert finite([p.grad for p in model.parameters() if p.grad is not None])
     # a feature that nothing reads learns nothing, but every head does
     learned = {name.split(".")[1] for name, p in model.named_parameters() if p.grad is not None}
-    assert learned.issuperset(combination.heads)
+    assert learned.issuperset(head for head in combination.heads if any(True for _ in model.head[head].parameters()))
     optimizer.step()
     with torch.no_grad():
         results = model.eval().predict(batch)

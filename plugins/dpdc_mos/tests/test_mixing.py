@@ -241,9 +241,9 @@ def test_a_backbone_on_the_range_image_of_another_sensor() -> None:
 
 def test_real_scans_go_through() -> None:
     """The public SemanticKITTI scans: residuals mark what moves far more often than what stands."""
-    if not os.environ.get("LIDARFW_REAL_DATA"):
+    root = Path(os.environ.get("LIDARFW_REAL_DATA", "nowhere")) / "semantic_kitti"
+    if not root.is_dir():
         pytest.skip("no real data here: set LIDARFW_REAL_DATA to a folder with the official layouts")
-    root = Path(os.environ["LIDARFW_REAL_DATA"]) / "semantic_kitti"
     from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 
     data = SemanticKittiDataset(root=str(root), split="04", task="moving", sweeps=3, pose=True)

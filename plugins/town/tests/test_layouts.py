@@ -261,6 +261,19 @@ def test_the_command_reports_errors_plainly(tmp_path: Path, capsys: pytest.Captu
 # what only one layout has
 
 
+@pytest.mark.parametrize("written", ["kitti"], indirect=True)
+def test_scans_are_a_folder_of_ones_own(written: Job, dataset: Dataset) -> None:
+    scans = make_dataset(
+        {"dataset": {"folder": {"type": "folder", "root": f"{written.root}/training/velodyne"}}}, "all"
+    )
+    assert len(scans) == FRAMES
+    assert check_dataset(scans).faults == []
+    for number in range(FRAMES):
+        expected, found = dataset[number].inputs["points"], scans[number].inputs["points"]
+        assert torch.equal(found.xyz, expected.xyz)
+        assert torch.equal(found.features, expected.features)
+
+
 def test_kitti_360_scans_lie_on_depth_and_semantics_of_the_pictures(written: Job, dataset: Dataset) -> None:
     if written.layout != "kitti_360":
         pytest.skip("of KITTI-360 only")
