@@ -66,9 +66,20 @@ def test_one_stage_stays_as_it_is() -> None:
     torch.testing.assert_close(vote(unstaged).tensor, single.tensor)
 
 
-def test_last_stages_only() -> None:
-    found = vote(stages([1, 2, 6], [0, 0, 0], [0.5, 0.5, 0.5]), last=2)
-    torch.testing.assert_close(found.center[0, 0], torch.tensor(4.0))
+def test_only_the_chosen_stages_vote() -> None:
+    found = stages([1, 2, 6], [0, 0, 0], [0.5, 0.5, 0.5])
+    torch.testing.assert_close(vote(found, stages=(2, 3)).center[0, 0], torch.tensor(4.0))
+    torch.testing.assert_close(vote(found, stages=(1,)).tensor, found.tensor[:1])
+    with pytest.raises(ConfigError, match=r"there are boxes of the stages \[1, 2, 3\]"):
+        vote(found, stages=(4,))
+
+
+@pytest.mark.parametrize("mode", ["stage", "cluster"])
+def test_proposals_vote_only_when_they_are_named(mode: str) -> None:
+    found = stages([1, 1.2, 1.6], [0, 0, 0], [0.9, 0.5, 0.5])
+    found = found.replace(stage=torch.arange(3))
+    torch.testing.assert_close(vote(found, mode=mode).center[0, 0], torch.tensor(1.4))
+    torch.testing.assert_close(vote(found, mode=mode, stages=(0,)).tensor, found.tensor[:1])
 
 
 def test_regions_vote_apart_in_their_samples() -> None:

@@ -292,9 +292,11 @@ def test_velocity_and_class_stay_those_of_the_proposal() -> None:
     found = net.decode(net(proposals, bev()))
     assert found.stage is not None
     assert found.velocity is not None
-    assert found.stage.bincount().tolist() == [0, 8, 8, 8]
-    torch.testing.assert_close(found.velocity.view(3, 8, 2)[2], found.velocity.view(3, 8, 2)[0])
-    assert torch.equal(found.label.view(3, 8)[1], proposals.label)
+    assert found.stage.bincount().tolist() == [8, 8, 8, 8]
+    torch.testing.assert_close(found.velocity.view(4, 8, 2)[3], found.velocity.view(4, 8, 2)[0])
+    assert torch.equal(found.label.view(4, 8)[1], proposals.label)
+    torch.testing.assert_close(found.tensor[:8], proposals.tensor)
+    torch.testing.assert_close(found.score[:8], proposals.score)
 
 
 def test_no_proposals_no_boxes() -> None:

@@ -33,7 +33,7 @@ RADII = (2.0, 4.0)  # times the horizontal size of a voxel of the level
 POINT_RADII = (0.4, 0.8)  # metres
 CHANNELS = 32  # of every kind of sites and radius
 # suppression of proposals
-TRAINING: dict[str, Any] = {"iou_threshold": 0.8, "score_threshold": 0.0, "max_candidates": 4000, "max_per_frame": 512}
+TRAINING: dict[str, Any] = {"iou_threshold": 0.8, "score_threshold": 0.0, "max_per_frame": 512}
 INFERENCE: dict[str, Any] = TRAINING | {"iou_threshold": 0.75}
 
 
@@ -90,6 +90,7 @@ class MSRMHead(Head):
         *,
         stages: int = 3,
         regions: int = 160,
+        candidates: int = 4000,
         pool: str = "auto",
         strides: tuple[int, ...] = (4, 8),
         grid: int = 6,
@@ -101,10 +102,11 @@ class MSRMHead(Head):
     ) -> None:
         """Options.
 
-        regions: proposals a sample, in training and after. pool: where features come from, voxels (of the levels
-        `strides`), points or bev; auto is voxels where all these levels are there, else bev. neighbors: voxels or
-        points of each grid point. channels, heads, dropout: of the stage tokens and their attention. foreground: IoU of
-        every stage, by class name, over which a region learns a box.
+        regions: proposals a sample, in training and after. candidates: the best proposals, among which they are chosen.
+        pool: where features come from, voxels (of the levels `strides`), points or bev; auto is voxels where all these
+        levels are there, else bev. neighbors: voxels or points of each grid point. channels, heads, dropout: of the
+        stage tokens and their attention. foreground: IoU of every stage, by class name, over which a region learns a
+        box.
         """
         super().__init__()
         _check(stages, regions, channels, heads, pool)
@@ -118,7 +120,9 @@ class MSRMHead(Head):
         self.confidence = nn.ModuleList(branch(2 * channels, channels, 1, dropout) for _ in range(stages))
         self.correction = nn.ModuleList(branch(2 * channels, channels, 7, dropout) for _ in range(stages))
         self.parts = PartScore(bev)
-        self.suppress_training, self.suppress = NMS(boxes, **TRAINING), NMS(boxes, **INFERENCE)
+        self.suppress_training, self.suppress = (
+            NMS(boxes, max_candidates=candidates, **way) for way in (TRAINING, INFERENCE)
+        )
         confident = [CONFIDENCE[_column(name)] for name in data.classes]
         self.register_buffer("foreground", thresholds(data.classes, stages, foreground), persistent=False)
         self.register_buffer("confident", torch.tensor(confident).view(-1, 2), persistent=False)
@@ -157,16 +161,13 @@ class MSRMHead(Head):
         )
 
     def decode(self, output: MSRMOutput) -> Boxes:
-        """The boxes of all stages, stage by stage, `stage` counted from 1; their score is the stage's confidence."""
-        stages = len(output.residual)
-        if stages == 0 or len(output.rois) == 0:
-            return output.rois.replace(stage=torch.zeros_like(output.rois.label))
-        parts = []
-        for stage in range(stages):
-            box, score = output.boxes[stage + 1], output.confidence[stage].sigmoid()
-            number = torch.full_like(output.rois.label, stage + 1)
-            changed = {"center": box[:, :3], "size": box[:, 3:6], "yaw": box[:, 6], "score": score, "stage": number}
-            parts.append(output.rois.replace(**changed))
+        """The boxes of all stages, stage by stage: stage 0 are the proposals with their scores, the others have the
+        stage's confidence."""
+        rois = output.rois
+        parts = [rois.replace(stage=torch.zeros_like(rois.label))]
+        for number, (box, logit) in enumerate(zip(output.boxes[1:], output.confidence, strict=True), 1):
+            changed = {"center": box[:, :3], "size": box[:, 3:6], "yaw": box[:, 6], "score": logit.sigmoid()}
+            parts.append(rois.replace(**changed, stage=torch.full_like(rois.label, number)))
         return Boxes.cat(parts)
 
     @torch.no_grad()

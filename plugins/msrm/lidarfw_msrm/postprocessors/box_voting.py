@@ -21,9 +21,9 @@ class BoxVoting(PostProcessor):
     """The mean of boxes weighted by their confidence (MSRM, equation 8).
 
     mode stage: the boxes of the stages of a cascade, region by region (every stage gives its regions in the same
-    order, `stage` says which is which); `last` takes only so many last stages, 0 all. Mode cluster: the best box and
-    all of its class that overlap it by a 3D IoU over `iou_threshold`, then the best of the rest; works after any
-    detector or ensemble. The score is the mean of the scores. weights uniform: the plain mean.
+    order, `stage` says which is which). Mode cluster: the best box and all of its class that overlap it by a 3D IoU
+    over `iou_threshold`, then the best of the rest; works after any detector or ensemble. The score is the mean of the
+    scores. weights uniform: the plain mean. stages: those that vote; none named, all but stage 0, the proposals.
 
     Yaw is averaged on the circle after every box is turned to the side of the most confident one: boxes that
     stand for the same object may point in opposite ways. Other fields are those of the most confident box.
@@ -35,25 +35,36 @@ class BoxVoting(PostProcessor):
         *,
         mode: str = "stage",
         weights: str = "confidence",
-        last: int = 0,
+        stages: tuple[int, ...] = (),
         iou_threshold: float = 0.5,
     ) -> None:
         super().__init__()
         for name, value, known in (("mode", mode, MODES), ("weights", weights, WEIGHTS)):
             if value not in known:
                 raise ConfigError(f"postprocessor 'box_voting': {name} is one of {', '.join(known)}, not {value!r}")
-        self.mode, self.weights, self.last, self.iou_threshold = mode, weights, last, iou_threshold
+        self.mode, self.weights, self.stages, self.iou_threshold = mode, weights, tuple(stages), iou_threshold
         self.provides = boxes
 
     def forward(self, boxes: Boxes) -> Boxes:
         """One box for each region or cluster."""
+        if boxes.stage is not None and len(boxes):
+            boxes = self._chosen(boxes, boxes.stage)
         if self.mode == "cluster":
             return self._vote(boxes, self._clusters(boxes))
         if boxes.stage is None or len(boxes) == 0:
             return boxes  # of one stage
-        if self.last:
-            boxes = boxes[boxes.stage > boxes.stage.max() - self.last]
         return self._vote(boxes, _regions(boxes))
+
+    def _chosen(self, boxes: Boxes, stage: Tensor) -> Boxes:
+        missing = set(self.stages) - set(stage.tolist())
+        if missing:
+            raise ConfigError(
+                f"postprocessor 'box_voting': stages {sorted(self.stages)} are to vote\n"
+                f"  there are boxes of the stages {sorted(set(stage.tolist()))}\n"
+                "  fix: postprocessor.box_voting.stages=[] for all but stage 0, the proposals"
+            )
+        chosen = torch.isin(stage, stage.new_tensor(self.stages)) if self.stages else stage > 0
+        return boxes[chosen]
 
     def _clusters(self, boxes: Boxes) -> Tensor:
         """Cluster (N,) of each box, counted from 0."""
