@@ -37,6 +37,7 @@ _SIDEWAYS = 2.2  # m/s2 that a driver takes in curves
 _LOOK = np.arange(2, 46, 2.0)  # metres ahead on the own path at which others are looked for
 _FORESEEN = np.arange(0.5, 3.1, 0.5)  # seconds ahead that drivers look at the ways of others
 _PATIENCE = 5.0  # seconds after which a driver no longer gives way
+_JAM, _DRAWS = 20.0, 8  # seconds of standing after which a drive is drawn anew, and how often at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,7 @@ class Traffic:
         self._world, self._traversal, self._circuit = world, traversal, circuit
         self._rng = np.random.default_rng((world.seed, 1, traversal))
         self.parked = self._park(traversal)
-        walkers = Walkers(*self._loops())
-        vehicles = self._drive(steps, walkers)
+        walkers, vehicles = self._flowing(steps)
         self.ego = vehicles[0].track
         self.movers = [*vehicles[1:], *self._crossing(walkers), *self._strolling(steps)]
 
@@ -106,6 +106,15 @@ class Traffic:
             place = slots.center[slot] + ahead * rng.uniform(-0.1, 0.1) * (SLOT - 5) + rng.normal(0, 0.06, 2)
             parked.append(Parked(10000 + int(slot), kind, seed, np.array([*place, yaw])))
         return parked
+
+    def _flowing(self, steps: int) -> tuple[Walkers, list[Mover]]:
+        """Walkers and vehicles, the ego vehicle first; drawn anew where it is caught in a jam that does not dissolve."""
+        for _ in range(_DRAWS):
+            walkers = Walkers(*self._loops())
+            vehicles = self._drive(steps, walkers)
+            if _longest_stand(vehicles[0].track) < _JAM:
+                break
+        return walkers, vehicles
 
     def _drive(self, steps: int, walkers: Walkers, count: int = 24) -> list[Mover]:
         rng, network = self._rng, self._world.network
@@ -179,6 +188,12 @@ class Traffic:
         # a wheel on the kerb lifts no vehicle
         lift = self._world.lift(place[:2], 0.0 if kind == "pedestrian" else 1.5)
         return float(self._world.hills.height(place[:2])) + lift
+
+
+def _longest_stand(track: Array) -> float:
+    """Seconds that the longest halt of a track (T, 4) lasts."""
+    moves = np.flatnonzero(np.concatenate([[True], track[:, 3] >= 0.3, [True]]))
+    return float(np.diff(moves).max() - 1) * PERIOD
 
 
 def _fastest(kind: str, highway: bool) -> float:

@@ -78,6 +78,12 @@ def test_the_same_seed_gives_the_same_traffic(world: World, traffic: Traffic) ->
     assert (again._world.mesh.triangles == world.mesh.triangles).all()
 
 
+def test_the_vehicle_with_the_sensor_gets_round_its_circuit() -> None:
+    # a bus and another car stood in this one's way for ever, when the traffic was drawn for the first time
+    ego = Traffic(World(1), 0, 300, circuit=True).ego
+    assert np.linalg.norm(np.diff(ego[:, :2], axis=0), axis=1).sum() > 100
+
+
 def test_a_walker_waits_while_told_to_and_then_crosses() -> None:
     corners = np.array([[0.0, -5], [30, -5], [30, 5], [0, 5], [0, -5]])
     at = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
