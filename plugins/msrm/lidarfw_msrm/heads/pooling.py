@@ -61,12 +61,22 @@ def neighbors(sites: Sites, xyz: Tensor, batch: Tensor, radii: Sequence[float], 
     return pairs
 
 
+def aggregation_cost(sites: int, places: int, neighbors: int, in_channels: int, channels: int) -> tuple[int, int]:
+    """Products of the PointNet on [features, offset] of every pair, and of its decomposed form (section II-C).
+
+    T K (C + 3) C' and N C C' + T K 3 C', of N sites with C channels, T places with K neighbours each, C' channels out.
+    The paper writes M for T in the second; no other reading fits its text. Both leave out what is the same in both,
+    the layer after the maximum.
+    """
+    pairs = places * neighbors
+    return pairs * (in_channels + 3) * channels, sites * in_channels * channels + pairs * 3 * channels
+
+
 class Aggregation(nn.Module):
     """Decomposed PointNet over the neighbours of a point (section II-C): the sites' features are transformed once per
     site, the offsets once per pair, and the maximum of their sum is taken.
 
-    Equal to a PointNet on [features, offset] whose normalisation is folded; costs N C C' + M K 3 C' instead of
-    M K (C + 3) C' products (N sites, M points, K neighbours).
+    Equal to a PointNet on [features, offset] whose normalisation is folded; `aggregation_cost` has what is saved.
     """
 
     def __init__(self, in_channels: int, channels: int) -> None:
