@@ -28,7 +28,7 @@ else:
 PICTURE = (1242, 375)  # usual width and height; assumed where no pictures were downloaded
 CANVAS = (1248, 384)  # pictures differ by some pixels: as an input they are padded to this at the right and bottom
 _SUFFIXES = (".png", ".jpg")
-_CAMERA = Camera("pinhole", *CANVAS, (721.5377, 721.5377, 609.5593, 172.854))  # of most recordings, for the spec
+CAMERA = Camera("pinhole", *CANVAS, (721.5377, 721.5377, 609.5593, 172.854))  # of most recordings, for the spec
 
 
 class KittiDataset(Dataset):
@@ -59,7 +59,7 @@ class KittiDataset(Dataset):
         self.root, self.split, self.classes = root, split, tuple(classes)
         self.camera_view, self.image = camera_view, image
         inputs = {"points": Spec(Points, channels=1)}
-        inputs |= {"image": Spec(Image, channels=3, geometry=_CAMERA)} if image else {}
+        inputs |= {"image": Spec(Image, channels=3, geometry=CAMERA)} if image else {}
         self.spec = DataSpec(inputs, frozenset() if split == "test" else frozenset({Boxes}), self.classes)
 
     @property
@@ -184,16 +184,7 @@ class KittiDataset(Dataset):
                 f"{self.folder / 'image_2'}: no picture {meta.id}.png.\n"
                 f"  fix: download it, or dataset.kitti.image=false"
             )
-        picture = read_image(meta.images[kitti.IMAGE])
-        height, width = picture.shape[:2]
-        if width > CANVAS[0] or height > CANVAS[1]:
-            raise DataError(
-                f"{meta.images[kitti.IMAGE]}: expected at most {CANVAS[0]} x {CANVAS[1]} pixels, "
-                f"found {width} x {height}. KITTI's pictures are about {PICTURE[0]} x {PICTURE[1]}"
-            )
-        canvas = np.zeros((3, CANVAS[1], CANVAS[0]), np.float32)
-        canvas[:, :height, :width] = picture.transpose(2, 0, 1) / 255
-        return Image(torch.tensor(canvas)[None], (meta.cameras[kitti.IMAGE].cropped(0, 0, *CANVAS),))
+        return padded_picture(meta.images[kitti.IMAGE], meta.cameras[kitti.IMAGE], CANVAS)
 
     def _targets(self, name: str, calibration: kitti.Calibration) -> Targets:
         if self.split == "test":
@@ -202,6 +193,23 @@ class KittiDataset(Dataset):
         labels = kitti.read_labels(self.folder / "label_2" / f"{name}.txt", types)
         boxes, ignored = kitti.boxes_from_labels(labels, calibration, self.classes)
         return Targets(boxes=boxes, ignored=ignored)
+
+
+def padded_picture(path: str, camera: Camera, canvas: tuple[int, int]) -> Image:
+    """A picture 0..1 as an input, padded with black at the right and bottom to `canvas` (width, height).
+
+    DataError where it is larger.
+    """
+    picture = read_image(path)
+    height, width = picture.shape[:2]
+    if width > canvas[0] or height > canvas[1]:
+        raise DataError(
+            f"{path}: expected at most {canvas[0]} x {canvas[1]} pixels, "
+            f"found {width} x {height}. KITTI's pictures are about {PICTURE[0]} x {PICTURE[1]}"
+        )
+    padded = np.zeros((3, canvas[1], canvas[0]), np.float32)
+    padded[:, :height, :width] = picture.transpose(2, 0, 1) / 255
+    return Image(torch.tensor(padded)[None], (camera.cropped(0, 0, *canvas),))
 
 
 def picture_size(path: str) -> tuple[int, int]:

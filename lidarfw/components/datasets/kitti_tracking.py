@@ -25,9 +25,9 @@ from lidarfw.components.datasets.drives import (
     rigid,
     scans_in,
 )
-from lidarfw.components.datasets.kitti import PICTURE, picture_size
+from lidarfw.components.datasets.kitti import CAMERA, PICTURE, padded_picture, picture_size
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.types import Boxes, DataSpec, Frame, FrameMeta, Points, Poses, Spec, Targets, Tracks
+from lidarfw.types import Boxes, Camera, DataSpec, Frame, FrameMeta, Image, Points, Poses, Spec, Targets, Tracks
 
 if TYPE_CHECKING:
     import torch
@@ -64,6 +64,7 @@ class KittiTrackingDataset(DriveDataset):
         "trainval": _names(*range(21)),
         "test": _names(*range(29)),
     }
+    camera: Camera = CAMERA  # of the padded pictures, for the spec
 
     def __init__(
         self,
@@ -75,6 +76,7 @@ class KittiTrackingDataset(DriveDataset):
         poses: str = "oxts",
         sweeps: int = 1,
         pose: bool = False,
+        image: bool = False,
     ) -> None:
         """Options.
 
@@ -82,15 +84,16 @@ class KittiTrackingDataset(DriveDataset):
         by +. classes: types to learn. camera_view: keep only points in the picture, since only what it shows is
         labelled. poses: folder of the poses in training/, `oxts` or one with lines of camera poses; none where empty.
         sweeps: scans per frame, the past ones moved into the current frame. pose: also give the LiDAR's pose, as the
-        input `pose`.
+        input `pose`. image: also give the left colour picture, as the input `image`.
         """
         if sweeps < 1:
             raise ConfigError(f"dataset.kitti_tracking.sweeps must be at least 1, got {sweeps}")
         if not poses and (pose or sweeps > 1):
             raise ConfigError("dataset.kitti_tracking: pose=true and sweeps > 1 need poses.\n  fix: poses=oxts")
         self.root, self.split, self.classes, self.camera_view = root, split, tuple(classes), camera_view
-        self.poses, self.sweeps, self.pose = poses, sweeps, pose
+        self.poses, self.sweeps, self.pose, self.image = poses, sweeps, pose, image
         inputs = {"points": Spec(Points, channels=1)} | ({"pose": Spec(Poses)} if pose else {})
+        inputs |= {"image": Spec(Image, channels=3, geometry=self.camera)} if image else {}
         labels = frozenset() if split == "test" else frozenset({Boxes, Tracks})
         self.spec = DataSpec(inputs, labels | frozenset({Poses} if poses else ()), self.classes, sweeps)
         self._recordings: dict[str, _Recording] = {}
@@ -141,9 +144,20 @@ class KittiTrackingDataset(DriveDataset):
         points, pose = self.points(drive, place), pose_of(drive, place)
         if self.camera_view:
             points = points[meta.cameras[kitti.IMAGE].project(points.xyz)[2]]
-        inputs: dict[str, Points | Poses | None] = {"points": points} | ({"pose": pose} if self.pose else {})
+        inputs: dict[str, Points | Poses | Image | None] = {"points": points} | ({"pose": pose} if self.pose else {})
+        if self.image:
+            inputs["image"] = self._image(meta)
         targets = Targets() if self.split == "test" else self._objects(recording, int(drive.scans[place].stem))
         return Frame(inputs, targets.replace(poses=pose), meta)
+
+    def _image(self, meta: FrameMeta) -> Image:
+        if not meta.images:
+            raise DataError(
+                f"{self.folder / 'image_02' / meta.id}.png: no such picture.\n  fix: download it, or image=false"
+            )
+        return padded_picture(
+            meta.images[kitti.IMAGE], meta.cameras[kitti.IMAGE], (self.camera.width, self.camera.height)
+        )
 
     def _objects(self, recording: _Recording, frame: int) -> Targets:
         lines = recording.labels.get(frame, [])

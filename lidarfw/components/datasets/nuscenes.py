@@ -15,9 +15,9 @@ from lidarfw import nuscenes
 from lidarfw._lazy import LazyModule
 from lidarfw.components.datasets.drives import Array, Drive, DriveDataset, inverse, pose_of
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.io import read_points
+from lidarfw.io import read_image, read_points
 from lidarfw.nuscenes import CLASSES
-from lidarfw.types import Boxes, Camera, DataSpec, Frame, FrameMeta, Points, Poses, Spec, Targets, Tracks
+from lidarfw.types import Boxes, Camera, DataSpec, Frame, FrameMeta, Image, Points, Poses, Spec, Targets, Tracks
 
 if TYPE_CHECKING:
     import torch
@@ -26,6 +26,7 @@ else:
 
 _OWN = 1.0  # metres: past returns nearer than this along x and y are of the vehicle itself
 _FULL = 255  # intensity that becomes 1
+_CAMERA = Camera("pinhole", 1600, 900, (1266.4172, 1266.4172, 816.267, 491.5071))  # CAM_FRONT of a scene, for the spec
 _MINI_VAL = (103, 916)
 _VAL = (
     3, *range(12, 19), 35, 36, 38, 39, *range(92, 111), 221, *range(268, 279), *range(329, 333), *range(344, 347),
@@ -43,6 +44,8 @@ class NuScenesDataset(DriveDataset):
     log's map. Boxes without a LiDAR or radar point are ignored targets, as in the benchmark.
     """
 
+    camera: Camera = _CAMERA  # for the spec
+
     def __init__(
         self,
         *,
@@ -52,13 +55,15 @@ class NuScenesDataset(DriveDataset):
         classes: tuple[str, ...] = CLASSES,
         sweeps: int = 10,
         pose: bool = False,
+        image: str = "",
     ) -> None:
         """Options.
 
         root: folder that holds the version, samples/ and sweeps/. split: train, val (of v1.0-mini: mini_train,
         mini_val), all, or scenes such as scene-0061; joined by +. version: v1.0-trainval, v1.0-mini or v1.0-test,
         which has no labels. classes: of the detection benchmark. sweeps: scans per frame, 20 a second, the past ones
-        moved into the frame of the current one. pose: also give the LiDAR's pose, as the input `pose`.
+        moved into the frame of the current one. pose: also give the LiDAR's pose, as the input `pose`. image: a camera
+        such as CAM_FRONT, whose picture is also given, as the input `image`; none where empty.
         """
         unknown = [name for name in classes if name not in nuscenes.CLASSES]
         if unknown:
@@ -67,9 +72,10 @@ class NuScenesDataset(DriveDataset):
         if sweeps < 1:
             raise ConfigError(f"dataset.nuscenes.sweeps must be at least 1, got {sweeps}")
         self.root, self.split, self.version = root, split, version
-        self.classes, self.sweeps, self.pose = tuple(classes), sweeps, pose
+        self.classes, self.sweeps, self.pose, self.image = tuple(classes), sweeps, pose, image
         self.labelled = not version.endswith("test")
         inputs = {"points": Spec(Points, channels=1)} | ({"pose": Spec(Poses)} if pose else {})
+        inputs |= {"image": Spec(Image, channels=3, geometry=self.camera)} if image else {}
         targets = frozenset({Boxes, Tracks, Poses} if self.labelled else {Poses})
         self.spec = DataSpec(inputs, targets, self.classes, sweeps)
 
@@ -141,10 +147,27 @@ class NuScenesDataset(DriveDataset):
         drive, place = self.find(index)
         scene, pose = self.scenes[drive.name], pose_of(drive, place)
         points = self.points(self._whole(drive.name), scene.keys[place])
-        inputs: dict[str, Points | Poses | None] = {"points": points} | ({"pose": pose} if self.pose else {})
+        inputs: dict[str, Points | Poses | Image | None] = {"points": points} | ({"pose": pose} if self.pose else {})
+        meta = self.meta(index)
+        if self.image:
+            inputs["image"] = self._picture(meta)
         lidar = scene.sweeps.poses[scene.keys[place]]
         targets = self._targets(scene.objects[place], lidar) if self.labelled else Targets()
-        return Frame(inputs, targets.replace(poses=pose), self.meta(index))
+        return Frame(inputs, targets.replace(poses=pose), meta)
+
+    def _picture(self, meta: FrameMeta) -> Image:
+        if self.image not in meta.images:
+            there = ", ".join(meta.images) or "none"
+            raise DataError(
+                f"frame {meta.id} has no picture of {self.image}; of: {there}\n  fix: dataset.nuscenes.image= (none)"
+            )
+        picture, camera = read_image(meta.images[self.image]), meta.cameras[self.image]
+        if picture.shape[:2] != (camera.height, camera.width):
+            raise DataError(
+                f"{meta.images[self.image]}: expected {camera.width} x {camera.height} pixels, "
+                f"found {picture.shape[1]} x {picture.shape[0]}"
+            )
+        return Image(torch.tensor(picture.transpose(2, 0, 1)[None]).float() / 255, (camera,))
 
     def scans(self, drive: Drive, place: int) -> list[Points]:
         """The scans of a frame; past ones without the vehicle, which else would leave a trail."""

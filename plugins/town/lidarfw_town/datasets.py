@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from lidarfw.components.datasets.drives import DriveDataset
-from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.datasets.kitti import CAMERA, PICTURE, KittiDataset
 from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.components.datasets.kitti_tracking import KittiTrackingDataset
 from lidarfw.components.datasets.nuscenes import NuScenesDataset
@@ -29,6 +29,7 @@ from lidarfw_town.version import VERSION
 if TYPE_CHECKING:
     from lidarfw_town.generate import Job
 
+_TILE = 32  # pixels: pictures as inputs are padded to whole ones, for networks of that stride
 VALIDATION_SHARE = 4  # of single frames: one of validation for four of training
 
 
@@ -149,6 +150,7 @@ class TownTracking(TownDrives, KittiTrackingDataset):
         poses: str = "oxts",
         sweeps: int = 1,
         pose: bool = False,
+        image: bool = False,
         drives: int = 4,
         length: int = 60,
         sensor: str = "small",
@@ -160,16 +162,20 @@ class TownTracking(TownDrives, KittiTrackingDataset):
     ) -> None:
         """Options.
 
-        split: train or val. classes, camera_view, poses, sweeps, pose: as in `kitti_tracking`. drives, length: see
-        `TownDrives`. The others: see `TownDataset`.
+        split: train or val. classes, camera_view, poses, sweeps, pose, image: as in `kitti_tracking`. drives, length:
+        see `TownDrives`. The others: see `TownDataset`.
         """
         root = self._settle_drives(
             split, drives, length, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width,
             weather=weather,
         )  # fmt: skip
+        if picture_width:
+            whole = replace(CAMERA, width=PICTURE[0], height=PICTURE[1]).scaled(picture_width / PICTURE[0])
+            self.camera = whole.cropped(0, 0, *(-(-side // _TILE) * _TILE for side in (whole.width, whole.height)))
         super().__init__(
-            root=root, split=split, classes=classes, camera_view=camera_view, poses=poses, sweeps=sweeps, pose=pose
-        )
+            root=root, split=split, classes=classes, camera_view=camera_view, poses=poses, sweeps=sweeps, pose=pose,
+            image=image,
+        )  # fmt: skip
 
 
 class TownMos(TownDrives, SemanticKittiDataset):
@@ -345,6 +351,7 @@ class TownNuScenes(TownDrives, NuScenesDataset):
         classes: tuple[str, ...] = CLASSES,
         sweeps: int = 5,
         pose: bool = False,
+        image: str = "",
         drives: int = 4,
         length: int = 100,
         sensor: str = "hdl32",
@@ -356,12 +363,14 @@ class TownNuScenes(TownDrives, NuScenesDataset):
     ) -> None:
         """Options.
 
-        split: train or val. classes, sweeps, pose: as in `nuscenes`; sweeps=5 is the half second that ten scans are
-        there. drives, length: see `TownDrives`; length counts scans, of which every fifth is a frame. picture_width:
-        of the six pictures of a key frame. The others: see `TownDataset`.
+        split: train or val. classes, sweeps, pose, image: as in `nuscenes`; sweeps=5 is the half second that ten scans
+        are there. drives, length: see `TownDrives`; length counts scans, of which every fifth is a frame.
+        picture_width: of the six pictures of a key frame. The others: see `TownDataset`.
         """
         root = self._settle_drives(
             split, drives, length, cache, workers, sensor=sensor, seed=seed, picture_width=picture_width,
             weather=weather,
         )  # fmt: skip
-        super().__init__(root=root, split=split, classes=classes, sweeps=sweeps, pose=pose)
+        if picture_width:
+            self.camera = self.camera.scaled(picture_width / self.camera.width)
+        super().__init__(root=root, split=split, classes=classes, sweeps=sweeps, pose=pose, image=image)
