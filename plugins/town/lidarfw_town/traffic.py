@@ -108,7 +108,7 @@ class Traffic:
         return parked
 
     def _flowing(self, steps: int) -> tuple[Walkers, list[Mover]]:
-        """Walkers and vehicles, the ego vehicle first; drawn anew where it is caught in a jam that does not dissolve."""
+        """Walkers and vehicles, the ego vehicle first; drawn anew where it is caught in a jam for long."""
         for _ in range(_DRAWS):
             walkers = Walkers(*self._loops())
             vehicles = self._drive(steps, walkers)
