@@ -43,8 +43,15 @@ class PerceptionModel(nn.Module):
                 outputs[step.id] = self._call(step, step.declared.takes, outputs, batch)
         for step in self.plan.of("tracker"):
             if self.training and step.declared.trainable is not None:
-                outputs[step.id] = self._call(step, step.declared.trainable, outputs, batch)
+                attached = self._attached(step, outputs)
+                outputs[step.id] = self._call(step, step.declared.trainable, {**outputs, **attached}, batch)
         return outputs
+
+    def _attached(self, step: Step, outputs: dict[str, Any]) -> dict[str, Any]:
+        """Predictions that a tracker trains on, still in the graph: its losses reach the head that made them."""
+        heads = {ref.producer for refs in step.takes.values() for ref in refs if ref.item == "value"}
+        heads = {head for head in heads if head.startswith("head.")}
+        return {f"{head}.decoded": self.get_submodule(head).decode(outputs[head]) for head in heads}
 
     def losses(self, outputs: dict[str, Any], batch: Batch, progress: float = 1.0) -> dict[str, dict[str, Tensor]]:
         """Weighted terms of every loss: name -> term -> scalar. `progress` is the share of training done, for ramps."""
@@ -142,11 +149,10 @@ class PerceptionModel(nn.Module):
         return next(part for part in value if _is(part, ref.kind)) if isinstance(value, tuple) else value
 
     def _decoded(self, head: str, outputs: dict[str, Any]) -> Any:
-        """The prediction of a head, cut from the graph; decoded once per batch."""
+        """The prediction of a head, decoded once per batch; cut from the graph, but for trackers (`_attached`)."""
         key = f"{head}.decoded"
         if key not in outputs:
-            step = next(step for step in self.plan.of("head") if step.id == head)
-            decoded: Record = self.component(step).decode(outputs[head])
+            decoded: Record = self.get_submodule(head).decode(outputs[head])
             outputs[key] = decoded.detach()
         return outputs[key]
 

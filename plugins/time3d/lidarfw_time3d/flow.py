@@ -13,10 +13,17 @@ import torch
 from lidarfw.ops import box_corners
 from torch import Tensor, nn
 
+from lidarfw_time3d.monocular import wrapped
+
 _REACH = 50.0  # metres that count as 1
 _WAVES = (0.1, 0.3, 1.0)  # rad/m
 _PIXELS = 1000.0  # pixels that count as 1
 _SHAPE, _CATEGORY = 128, 32
+CUES = ("box3d", "box2d", "appearance", "category")
+GEOMETRIES = ("ordered", "unordered", "raw")
+FLOWS = ("attention", "mlp")
+STATES = 3  # motion attributes of a family of classes at most: moving, parked, stopped of vehicles, say
+_OPTIONAL = ("box2d", "appearance")  # cues that a detector may not give
 
 
 def mlp(sizes: tuple[int, ...]) -> nn.Sequential:
@@ -30,62 +37,96 @@ def mlp(sizes: tuple[int, ...]) -> nn.Sequential:
 class CornerEmbedding(nn.Module):
     """PointNet over the corners of a box: (..., C, D) -> (..., 128).
 
-    The maximum over the corners forgets their order, and with it the heading; so every corner carries its number.
+    The maximum over the corners forgets their order, and with it the heading; so with `ordered` every corner carries
+    its number.
     """
 
-    def __init__(self, corners: int, dimensions: int) -> None:
+    def __init__(self, corners: int, dimensions: int, ordered: bool) -> None:
         super().__init__()
-        self.register_buffer("number", torch.eye(corners), persistent=False)
-        self.points, self.out = mlp((dimensions + corners, 64, _SHAPE)), nn.Linear(_SHAPE, _SHAPE)
+        self.register_buffer("number", torch.eye(corners if ordered else 0), persistent=False)
+        self.points = mlp((dimensions + len(self.number), 64, _SHAPE))
+        self.out, self.ordered = nn.Linear(_SHAPE, _SHAPE), ordered
 
     number: Tensor
 
     def forward(self, corners: Tensor) -> Tensor:
-        number = self.number.expand(*corners.shape[:-1], -1)
-        result: Tensor = self.out(self.points(torch.cat([corners, number], -1)).amax(-2))
+        if self.ordered:
+            corners = torch.cat([corners, self.number.expand(*corners.shape[:-1], -1)], -1)
+        result: Tensor = self.out(self.points(corners).amax(-2))
         return result
 
 
 class CueEmbedding(nn.Module):
     """Heterogeneous cues (section 3.2): 3D box, 2D box, appearance, class and score -> F (B, K, d).
 
-    A cue that is not there is a learned vector, and is dropped now and then in training, so that any subset will do.
+    `cues` are those that it looks at. A cue that is not there is a learned vector, and is dropped now and then in
+    training, so that any subset will do. `geometry` says how boxes are told: by their `ordered` corners, by
+    `unordered` ones, or by their `raw` numbers.
     """
 
-    def __init__(self, classes: int, width: int, appearance: int, dropout: float = 0.1) -> None:
+    def __init__(
+        self,
+        classes: int,
+        width: int,
+        appearance: int,
+        cues: tuple[str, ...] = CUES,
+        geometry: str = "ordered",
+        dropout: float = 0.1,
+    ) -> None:
         super().__init__()
-        self.box3d, self.box2d = CornerEmbedding(8, 3 + 6 * len(_WAVES)), CornerEmbedding(4, 2)
-        self.appearance = nn.Sequential(nn.LayerNorm(appearance), nn.Linear(appearance, _SHAPE)) if appearance else None
-        self.category = nn.Linear(classes, _CATEGORY)
-        self.absent = nn.ParameterList(nn.Parameter(torch.zeros(_SHAPE)) for _ in range(2 if appearance else 1))
-        inputs = (3 if appearance else 2) * _SHAPE + _CATEGORY + 1
+        self.cues = tuple(cue for cue in CUES if cue in cues and (cue != "appearance" or appearance))
+        places = 3 + 6 * len(_WAVES)
+        makers = {
+            "box3d": lambda: mlp((places + 4, 64, _SHAPE, _SHAPE)) if geometry == "raw"
+            else CornerEmbedding(8, places, geometry == "ordered"),
+            "box2d": lambda: mlp((4, 64, _SHAPE, _SHAPE)) if geometry == "raw"
+            else CornerEmbedding(4, 2, geometry == "ordered"),
+            "appearance": lambda: nn.Sequential(nn.LayerNorm(appearance), nn.Linear(appearance, _SHAPE)),
+            "category": lambda: nn.Linear(classes, _CATEGORY),
+        }  # fmt: skip
+        self.embed = nn.ModuleDict({cue: makers[cue]() for cue in self.cues})
+        self.absent = nn.ParameterDict({c: nn.Parameter(torch.zeros(_SHAPE)) for c in self.cues if c in _OPTIONAL})
+        inputs = sum(_CATEGORY if cue == "category" else _SHAPE for cue in self.cues) + 1
         self.join = nn.Sequential(
             nn.Linear(inputs, width), nn.ReLU(), nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU(),
             nn.LayerNorm(width),
         )  # fmt: skip
         self.classes, self.width, self.looks, self.dropout = classes, width, appearance, dropout
+        self.raw = geometry == "raw"
 
     def forward(
         self, boxes: Tensor, label: Tensor, score: Tensor, box2d: Tensor | None, appearance: Tensor | None
     ) -> Tensor:
         """Embeddings of boxes (B, K, 7) in the sensor frame of now; 2D boxes (B, K, 4) and appearance (B, K, A)."""
-        corners = box_corners(boxes.reshape(-1, 7)).reshape(*boxes.shape[:2], 8, 3)
-        parts = [self.box3d(waves(corners))]
-        known = boxes.new_zeros(*boxes.shape[:2], 4) if box2d is None else box2d / _PIXELS
-        rectangle = known[..., [0, 1, 0, 3, 2, 1, 2, 3]].reshape(*known.shape[:-1], 4, 2)
-        parts.append(self._or_absent(self.box2d(rectangle), 0, box2d is not None))
-        if self.appearance is not None:
-            seen = boxes.new_zeros(*boxes.shape[:2], self.looks) if appearance is None else appearance
-            parts.append(self._or_absent(self.appearance(seen), 1, appearance is not None))
-        category = nn.functional.one_hot(label, self.classes).to(boxes.dtype)
-        result: Tensor = self.join(torch.cat([*parts, self.category(category), score[..., None]], -1))
+        known = {
+            "box3d": self._box3d(boxes),
+            "box2d": self._box2d(boxes.new_zeros(*boxes.shape[:2], 4) if box2d is None else box2d / _PIXELS),
+            "appearance": boxes.new_zeros(*boxes.shape[:2], self.looks) if appearance is None else appearance,
+            "category": nn.functional.one_hot(label, self.classes).to(boxes.dtype),
+        }
+        there = {"box2d": box2d is not None, "appearance": appearance is not None}
+        parts = [self._or_absent(self.embed[cue](known[cue]), cue, there.get(cue, True)) for cue in self.cues]
+        result: Tensor = self.join(torch.cat([*parts, score[..., None]], -1))
         return result
 
-    def _or_absent(self, cue: Tensor, number: int, present: bool) -> Tensor:
+    def _box3d(self, boxes: Tensor) -> Tensor:
+        if self.raw:
+            angle = boxes[..., 6:]
+            return torch.cat([waves(boxes[..., :3]), boxes[..., 3:6], wrapped(angle)], -1)
+        return waves(box_corners(boxes.reshape(-1, 7)).reshape(*boxes.shape[:2], 8, 3))
+
+    def _box2d(self, rectangle: Tensor) -> Tensor:
+        if self.raw:
+            return rectangle
+        return rectangle[..., [0, 1, 0, 3, 2, 1, 2, 3]].reshape(*rectangle.shape[:-1], 4, 2)
+
+    def _or_absent(self, cue: Tensor, name: str, present: bool) -> Tensor:
+        if name not in self.absent:
+            return cue
         there = torch.full(cue.shape[:1], present, device=cue.device)
         if self.training:
             there = there & (torch.rand(len(there), device=cue.device) >= self.dropout)
-        return torch.where(there[:, None, None], cue, self.absent[number])
+        return torch.where(there[:, None, None], cue, self.absent[name])
 
 
 def waves(places: Tensor) -> Tensor:
@@ -100,20 +141,41 @@ def waves(places: Tensor) -> Tensor:
 class SpatialFlow(nn.Module):
     """Self-attention among the boxes of a frame (section 3.3): F (B, K, d) -> F^ (B, K, d), empty places 0.
 
-    Encoder layers with the norm last and no positional encoding: the geometry stands in the embedding.
+    Encoder layers with the norm last and no positional encoding: the geometry stands in the embedding. `kind="mlp"`
+    has networks of as many weights in their place, for each box by itself.
     """
 
-    def __init__(self, width: int, layers: int, heads: int, dropout: float = 0.1) -> None:
+    def __init__(self, width: int, layers: int, heads: int, kind: str = "attention", dropout: float = 0.1) -> None:
         super().__init__()
+        self.alone = kind == "mlp"
+        if self.alone:
+            self.layers: nn.Module = nn.Sequential(*(_Alone(width, dropout) for _ in range(layers)))
+            return
         layer = nn.TransformerEncoderLayer(width, heads, 4 * width, dropout, batch_first=True)
         self.layers = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
 
     def forward(self, features: Tensor, mask: Tensor) -> Tensor:
         if features.numel() == 0:
             return features
+        if self.alone:
+            each: Tensor = self.layers(features) * mask[..., None]
+            return each
         hidden = ~mask
         hidden = hidden & ~hidden.all(1, keepdim=True)  # a frame without boxes would have nothing to look at: NaN
         result: Tensor = self.layers(features, src_key_padding_mask=hidden) * mask[..., None]
+        return result
+
+
+class _Alone(nn.Module):
+    """As many weights as an encoder layer, without a look at the other boxes."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.network, self.norm = mlp((width, 6 * width, width)), nn.LayerNorm(width)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, features: Tensor) -> Tensor:
+        result: Tensor = self.norm(features + self.dropout(self.network(features)))
         return result
 
 
@@ -122,24 +184,27 @@ class TemporalFlow(nn.Module):
 
     The logits of eq. 3 come from the product of every attention head by a small network over the heads, without
     softmax; a learned number is the logit of "none", in a row for newborn and a column for lost objects. Eq. 4
-    gathers the past with the same products, with softmax. The time between the frames enters the past.
+    gathers the past with the same products, with softmax; with `kind="mlp"` it does not, and a network of as many
+    weights looks at the boxes of now alone. The time between the frames enters the past.
     """
 
-    def __init__(self, width: int, heads: int) -> None:
+    def __init__(self, width: int, heads: int, kind: str = "attention") -> None:
         super().__init__()
         self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
         self.combine = mlp((heads, heads, 1))
         self.newborn, self.lost = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(()))
         self.seconds, self.out = nn.Linear(1, width), nn.Linear(width, width)
         self.velocity, self.refine = mlp((width, width, width, 3)), mlp((width, width, width, 6))
+        self.attribute = mlp((width, width, width, STATES))
         for parameter in self.refine[-1].parameters():
             nn.init.zeros_(parameter)  # refinement starts at none
-        self.heads = heads
+        self.heads, self.gathers = heads, kind == "attention"
 
     def forward(
         self, past: Tensor, now: Tensor, past_mask: Tensor, now_mask: Tensor, seconds: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Logits (P, Kp + 1, Kn + 1), rows past and columns now; velocity (P, Kn, 3) m/s; refinement (P, Kn, 6) m.
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Logits (P, Kp + 1, Kn + 1), rows past and columns now; velocity (P, Kn, 3) m/s; refinement (P, Kn, 6) m;
+        logits (P, Kn, 3) of motion attributes.
 
         Args:
             past: (P, Kp, d).
@@ -150,12 +215,16 @@ class TemporalFlow(nn.Module):
         past = past + self.seconds(seconds[:, None])[:, None]
         product = self._products(past, now)
         logits = self.bordered(self.combine(product.movedim(1, -1))[..., 0].float(), past_mask, now_mask)
+        gathered = self._gathered(product, past, past_mask) if self.gathers else self.value(now).relu()
+        mixed = now + self.out(gathered)
+        return logits, self.velocity(mixed), self.refine(mixed), self.attribute(mixed)
+
+    def _gathered(self, product: Tensor, past: Tensor, past_mask: Tensor) -> Tensor:
+        """(P, Kn, d) of the past for each box now (eq. 4)."""
         closed = torch.where(past_mask[:, None, :, None], product, -1e9)
         share = closed.softmax(2) * past_mask[:, None, :, None]  # of every past box in each box now
         value = self.value(past).unflatten(-1, (self.heads, -1))
-        gathered = torch.einsum("phij,pihc->pjhc", share, value).flatten(2)
-        mixed = now + self.out(gathered)
-        return logits, self.velocity(mixed), self.refine(mixed)
+        return torch.einsum("phij,pihc->pjhc", share, value).flatten(2)
 
     def _products(self, past: Tensor, now: Tensor) -> Tensor:
         """(P, H, Kp, Kn) scaled products of keys of the past and queries of now, per head."""

@@ -8,12 +8,14 @@ from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Loss
 from lidarfw.ops import box_corners
 from lidarfw.types import Boxes, Spec, Targets
-from torch import Tensor
+from torch import Tensor, nn
 
 from lidarfw_time3d.flow import association, masked, refine
+from lidarfw_time3d.monocular import overlap_2d
 from lidarfw_time3d.time3d import Time3DOutput
 
-_NEAR = 2.0  # metres on the ground between a box and the object that it stands for
+_NEAR = 2.0  # metres on the ground between a box and the object that it stands for, or
+_OVERLAP = 0.5  # IoU of their rectangles in the picture
 FALSE = -1  # identity of a box that stands for no object
 
 
@@ -85,7 +87,10 @@ def objects(boxes: Boxes, targets: Targets) -> Tensor | None:
         return None
     known = targets.tracks.boxes
     apart = torch.cdist(boxes.center[:, :2].double(), known.center[:, :2].double())
-    near = (apart <= _NEAR) & (boxes.label[:, None] == known.label) & (boxes.batch[:, None] == known.batch)
+    near = apart <= _NEAR
+    if boxes.box2d is not None and known.box2d is not None:  # depth from a picture may be metres off
+        near |= overlap_2d(boxes.box2d.detach(), known.box2d.to(boxes.box2d)) >= _OVERLAP
+    near &= (boxes.label[:, None] == known.label) & (boxes.batch[:, None] == known.batch)
     order = boxes.score.argsort(descending=True, stable=True)
     chosen = greedy_match(torch.where(near, -apart, -torch.inf)[order])
     return torch.empty_like(chosen).index_copy_(0, order, chosen)
@@ -103,22 +108,34 @@ class TemporalConsistencyLoss(Loss):
     `consistency`: how far each corner of a box moved, against how far that of its labelled object moved, in the map,
     as a mean over corners and pairs (the paper writes a sum). It is blind to where the corner went; with `vector` it
     compares the displacements themselves. `anchor`: L1 of refined corners to the object's, which eq. 7 alone cannot
-    give. `velocity`: L1 to the object's displacement over time.
+    give. `velocity`: L1 to the object's displacement over time. `attribute`: cross-entropy to what the object does,
+    by `Boxes.attribute` of the labels (0, 1, 2), else by `Boxes.moving` (0 moves, 1 stands). The options are weights.
     """
 
-    def __init__(self, flow: Spec, *, vector: bool = False, anchor: float = 1.0, velocity: float = 1.0) -> None:
+    def __init__(
+        self,
+        flow: Spec,
+        *,
+        consistency: float = 1.0,
+        vector: bool = False,
+        anchor: float = 1.0,
+        velocity: float = 1.0,
+        attribute: float = 0.2,
+    ) -> None:
         super().__init__()
-        self.vector, self.anchor, self.velocity = vector, anchor, velocity
+        self.consistency, self.vector, self.anchor, self.velocity = consistency, vector, anchor, velocity
+        self.attribute = attribute
 
     def forward(self, flow: Time3DOutput, targets: Targets) -> dict[str, Tensor]:
-        """`consistency`, `anchor`, `velocity`."""
-        nothing = 0 * (flow.refinement.sum() + flow.velocity.sum())
+        """`consistency`, `anchor`, `velocity`, `attribute`."""
+        nothing = 0 * (flow.refinement.sum() + flow.velocity.sum() + flow.attribute.sum())
+        nothings = dict.fromkeys(("consistency", "anchor", "velocity", "attribute"), nothing)
         found = objects(flow.boxes, targets)
         if found is None or targets.tracks is None or len(flow.past) == 0:
-            return {"consistency": nothing, "anchor": nothing, "velocity": nothing}
+            return nothings
         pair, i, j = self._pairs(flow, found, targets)
         if len(pair) == 0:
-            return {"consistency": nothing, "anchor": nothing, "velocity": nothing}
+            return nothings
         past, now = flow.past[pair, i], flow.now[pair, j]
         true = targets.tracks.boxes
         true_past, true_now = (box_corners(flow.seen_from_now(true, found[rows], pair)) for rows in (past, now))
@@ -127,9 +144,10 @@ class TemporalConsistencyLoss(Loss):
         moved, should = refined - box_corners(known_past), true_now - true_past
         velocity = (true_now - true_past).mean(1) / flow.seconds.detach()[pair, None]
         return {
-            "consistency": consistency(moved, should, self.vector) + nothing,
+            "consistency": self.consistency * consistency(moved, should, self.vector) + nothing,
             "anchor": self.anchor * (refined - true_now).abs().mean() + nothing,
             "velocity": self.velocity * (flow.velocity[pair, j] - velocity).abs().mean() + nothing,
+            "attribute": self.attribute * _attribute_loss(flow.attribute[pair, j], true[found[now]]) + nothing,
         }
 
     def _pairs(self, flow: Time3DOutput, found: Tensor, targets: Targets) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,6 +157,22 @@ class TemporalConsistencyLoss(Loss):
         past, now = _slots(identity, flow.past), _slots(identity, flow.now)
         pair, i, j = ((past[:, :, None] == now[:, None]) & (past[:, :, None] >= 0)).nonzero().unbind(1)
         return pair, i, j
+
+
+def _attribute_loss(logits: Tensor, objects: Boxes) -> Tensor:
+    """Cross-entropy of logits (N, 3), 0 where nothing is said of what the objects do."""
+    if objects.attribute is None and objects.moving is None:
+        return 0 * logits.sum()
+    known = objects.attribute if objects.attribute is not None else _states(objects.moving)
+    said = known >= 0
+    return nn.functional.cross_entropy(logits, known.clamp(min=0), reduction="none")[said].sum() / said.sum().clamp(
+        min=1
+    )
+
+
+def _states(moving: Tensor) -> Tensor:
+    """0 moves, 1 stands, -1 not known, of 1, 0, -1."""
+    return torch.where(moving < 0, -1, 1 - moving.long())
 
 
 def consistency(moved: Tensor, should: Tensor, vector: bool = False) -> Tensor:

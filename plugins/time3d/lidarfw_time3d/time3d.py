@@ -16,7 +16,18 @@ from lidarfw.types import Boxes, FrameMeta, FrameResult, Poses, Record, Spec, Tr
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from lidarfw_time3d.flow import CueEmbedding, SpatialFlow, TemporalFlow, association, refine, unimodal
+from lidarfw_time3d.flow import (
+    CUES,
+    FLOWS,
+    GEOMETRIES,
+    STATES,
+    CueEmbedding,
+    SpatialFlow,
+    TemporalFlow,
+    association,
+    refine,
+    unimodal,
+)
 
 Int = npt.NDArray[np.int64]
 
@@ -32,6 +43,7 @@ class Time3DOutput(Record):
     logits: Tensor  # (P, K + 1, K + 1) affinity, rows past, columns now, the last ones "none"
     velocity: Tensor  # (P, K, 3) m/s of the boxes now, in the sensor frame of now
     refinement: Tensor  # (P, K, 6) metres of x, y, z, w, h, l of the boxes now
+    attribute: Tensor  # (P, K, 3) logits of the motion attributes of the boxes now
     past: Tensor  # (P, K) row of each box among the M, -1 for none
     now: Tensor  # (P, K)
     frames: Tensor  # (P, 2) the samples of the pair
@@ -96,8 +108,13 @@ class Time3D(Tracker):
     `affinity`: `learned`; `geometric` (distance from the place where the velocity leads, no training), `appearance`
     (cosine of `Boxes.embedding`), or the `sum` of learned and geometric. Boxes are seen from the sensor of now, also
     those in memory, so that where the drive is does not matter (the paper keeps them in the frame of the first pose
-    and their features in memory). `appearance` is the width of `Boxes.embedding` where the detector gives it, 0 for
-    none. With `refine` boxes are corrected by the network.
+    and their features in memory). With `refine`
+    boxes are corrected by the network, with `attributes` they carry the motion attribute that it sees.
+
+    `cues` are what the network looks at: `box3d`, `box2d`, `appearance` (`Boxes.embedding`, where the detector gives
+    it), `category`; `geometry` how boxes are told: by `ordered` corners, `unordered` ones, or `raw` numbers.
+    `spatial_flow` and `temporal_flow` are `attention`, or `mlp`: networks of the same size without a look at other
+    boxes or the past, to compare with. Unless `end_to_end`, the losses do not reach the detector.
 
     Output: boxes of this frame with ids, velocity and log-odds of moving. Raises ConfigError for unknown words, and
     DataError where time does not grow within a sequence.
@@ -112,7 +129,10 @@ class Time3D(Tracker):
         width: int = 256,
         layers: int = 3,
         heads: int = 8,
-        appearance: int = 0,
+        cues: tuple[str, ...] = ("box3d", "box2d", "appearance", "category"),
+        geometry: str = "ordered",
+        spatial_flow: str = "attention",
+        temporal_flow: str = "attention",
         memory: int = 5,
         slots: int = 128,
         threshold: float = 0.1,
@@ -121,28 +141,42 @@ class Time3D(Tracker):
         affinity: str = "learned",
         similarity: str = "sum",
         refine: bool = False,
+        attributes: bool = False,
+        end_to_end: bool = True,
         max_speed: dict[str, float] | None = None,
         default_max_speed: float = 40.0,
         max_gap: float = 3.0,
     ) -> None:
         super().__init__()
-        for name, value, known in (("affinity", affinity, AFFINITIES), ("similarity", similarity, SIMILARITIES)):
+        words = (
+            ("affinity", affinity, AFFINITIES), ("similarity", similarity, SIMILARITIES),
+            ("geometry", geometry, GEOMETRIES), ("spatial_flow", spatial_flow, FLOWS), ("temporal_flow", temporal_flow, FLOWS),
+            *(("cues", cue, CUES) for cue in cues),
+        )  # fmt: skip
+        for name, value, known in words:
             if value not in known:
                 raise ConfigError(f"{name}: expected one of {', '.join(known)}, found {value!r}")
-        if affinity == "appearance" and not appearance:
-            raise ConfigError("affinity=appearance needs the width of Boxes.embedding.\n  fix: appearance=N")
-        self.embedding = CueEmbedding(len(boxes.classes), width, appearance)
-        self.spatial, self.temporal = SpatialFlow(width, layers, heads), TemporalFlow(width, heads)
+        if affinity == "appearance" and not boxes.channels:
+            raise ConfigError(
+                "affinity=appearance needs boxes with an embedding, and the detector gives none.\n"
+                "  fix: a head that gives one (km3d does), or affinity=geometric"
+            )
+        if attributes and affinity not in ("learned", "sum"):
+            raise ConfigError(f"attributes=true needs affinity=learned or sum, found {affinity}")
+        self.embedding = CueEmbedding(len(boxes.classes), width, boxes.channels, tuple(cues), geometry)
+        self.spatial = SpatialFlow(width, layers, heads, spatial_flow)
+        self.temporal = TemporalFlow(width, heads, temporal_flow)
         self.max_speed = np.array(per_class(boxes.classes, max_speed, default_max_speed, "max_speed"))
         self.memory, self.slots, self.threshold, self.birth, self.min_hits = memory, slots, threshold, birth, min_hits
         self.affinity, self.similarity, self.refine, self.max_gap = affinity, similarity, refine, max_gap
-        self.appearance = appearance
+        self.appearance, self.attributes, self.end_to_end = boxes.channels, attributes, end_to_end
         self.provides = Spec(Tracks, classes=boxes.classes)
 
     # training
 
     def forward(self, boxes: Boxes, meta: list[FrameMeta], pose: Poses | None = None) -> Time3DOutput:
         """Affinities of all pairs of frames of the batch."""
+        boxes = boxes if self.end_to_end else boxes.detach()
         count = boxes.batch_size
         poses = torch.eye(4, device=boxes.center.device, dtype=torch.float64).repeat(count, 1, 1)
         if pose is not None:
@@ -155,8 +189,8 @@ class Time3D(Tracker):
         before = self._flow(boxes, past, poses, frames[:, 1])
         # each frame once as "now", then by pair
         current = self._flow(boxes, rows, poses, torch.arange(count, device=poses.device))[frames[:, 1]]
-        logits, velocity, change = self.temporal(before, current, past >= 0, now >= 0, seconds)
-        return Time3DOutput(logits, velocity, change, past, now, frames, seconds, boxes, poses)
+        told = self.temporal(before, current, past >= 0, now >= 0, seconds)
+        return Time3DOutput(*told, past, now, frames, seconds, boxes, poses)
 
     def _flow(self, boxes: Boxes, rows: Tensor, poses: Tensor, goal: Tensor) -> Tensor:
         """F^ (P, K, d) of boxes at rows (P, K), seen from the sensor at frames `goal` (P,)."""
@@ -190,11 +224,13 @@ class Time3D(Tracker):
         order = boxes.score.argsort(descending=True, stable=True)
         order = order[boxes.score[order] >= self.threshold][: self.slots]
         found = boxes[order].to("cpu")
-        logits, change = self._compare(state, found)
+        logits, change, attribute = self._compare(state, found)
         track = self._assign(state, found, logits)
         if self.refine and state.memory:
             refined = refine(found.tensor, change[-1].to(found.tensor))
             found = found.replace(center=refined[:, :3], size=refined[:, 3:6])
+        if self.attributes:
+            found = found.replace(attribute=attribute[-1].argmax(1))
         return [replace(frame, tracks=self._update(state, found, track))]
 
     def _tick(self, state: Time3DState, meta: FrameMeta, pose: Poses | None) -> None:
@@ -210,12 +246,12 @@ class Time3D(Tracker):
         if pose is not None and bool(pose.ok[0]):
             state.pose = pose.matrix[0].detach().cpu().double()
 
-    def _compare(self, state: Time3DState, found: Boxes) -> tuple[list[Tensor], Tensor]:
-        """Logits (N_f + 1, n + 1) to every frame in memory; refinement (F, n, 6) by each."""
-        nothing = torch.zeros(1, len(found), 6)
+    def _compare(self, state: Time3DState, found: Boxes) -> tuple[list[Tensor], Tensor, Tensor]:
+        """Logits (N_f + 1, n + 1) to every frame in memory; refinement (F, n, 6), attribute (F, n, 3) by each."""
+        change, attribute = torch.zeros(1, len(found), 6), torch.zeros(1, len(found), STATES)
         if not state.memory:
-            return [], nothing
-        learned, change = [], nothing
+            return [], change, attribute
+        learned = []
         if self.affinity in ("learned", "sum"):
             everything = Boxes.cat([*(slots.boxes for slots in state.memory), found], as_batch=True)
             poses = torch.stack([*(slots.pose for slots in state.memory), state.pose])
@@ -225,13 +261,15 @@ class Time3D(Tracker):
             seconds = torch.tensor([(state.time or 0.0) - slots.time for slots in state.memory]).float()
             now = features[-1:].expand(last, -1, -1)
             mask = rows >= 0
-            logits, _, change = self.temporal(features[:-1], now, mask[:-1], mask[-1:].expand(last, -1), seconds)
+            logits, _, change, attribute = self.temporal(
+                features[:-1], now, mask[:-1], mask[-1:].expand(last, -1), seconds
+            )
             learned = [_cut(table, len(slots.track), len(found)) for table, slots in zip(logits, state.memory)]
-            change = change[:, : len(found)]
+            change, attribute = change[:, : len(found)], attribute[:, : len(found)]
         tables = [
             self._logits(state, slots, found, learned[k] if learned else None) for k, slots in enumerate(state.memory)
         ]
-        return tables, change
+        return tables, change, attribute
 
     def _logits(self, state: Time3DState, slots: Slots, found: Boxes, learned: Tensor | None) -> Tensor:
         if self.affinity == "learned":

@@ -15,7 +15,13 @@ from lidarfw.plain import from_plain, to_plain
 from lidarfw.types import Boxes, FrameMeta, FrameResult, Poses, Spec, Targets, Tracks
 
 from lidarfw_time3d.flow import CueEmbedding, SpatialFlow, TemporalFlow, association, masked, refine, unimodal
-from lidarfw_time3d.losses import AssociationLoss, TemporalConsistencyLoss, association_loss, consistency
+from lidarfw_time3d.losses import (
+    AssociationLoss,
+    TemporalConsistencyLoss,
+    association_loss,
+    consistency,
+    identities,
+)
 from lidarfw_time3d.time3d import Slots, Time3D, Time3DOutput, assign
 
 SPEC = Spec(Boxes, classes=("Car", "Pedestrian"))
@@ -268,7 +274,10 @@ def test_more_boxes_than_places_keep_the_best() -> None:
 
 
 def test_unknown_words_are_refused() -> None:
-    for options in ({"affinity": "psychic"}, {"similarity": "median"}, {"affinity": "appearance"}):
+    for options in (
+        {"affinity": "psychic"}, {"similarity": "median"}, {"affinity": "appearance"}, {"cues": ("smell",)},
+        {"geometry": "flat"}, {"spatial_flow": "none"}, {"attributes": True, "affinity": "geometric"},
+    ):  # fmt: skip
         with pytest.raises(ConfigError, match=next(iter(options))):
             small(**options)
     with pytest.raises(ConfigError, match="single"):
@@ -304,7 +313,7 @@ def test_training_learns_who_is_who_and_how_boxes_move() -> None:
         optimizer.zero_grad()
         torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-    assert set(history[0]) == {"association", "consistency", "anchor", "velocity"}
+    assert set(history[0]) == {"association", "consistency", "anchor", "velocity", "attribute"}
     assert history[-1]["association"] < 0.3 * history[0]["association"]
     assert history[-1]["anchor"] < 0.7 * history[0]["anchor"]
     assert history[-1]["velocity"] < 0.5 * history[0]["velocity"]
@@ -312,6 +321,56 @@ def test_training_learns_who_is_who_and_how_boxes_move() -> None:
         table = unimodal(_batch(tracker.eval(), 0.3)[0].logits)[0]
     assert table.argmax(1)[:2].tolist() == [0, 2]  # the car that drove on; the one that is lost
     assert table.argmax(0)[:2].tolist() == [0, 2]  # the car that drove on; the newborn
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"cues": ("appearance",)}, {"cues": ("box2d", "category")}, {"geometry": "raw"}, {"geometry": "unordered"},
+     {"spatial_flow": "mlp", "temporal_flow": "mlp"}, {"attributes": True, "refine": True}],
+    ids=str,
+)  # fmt: skip
+def test_every_cue_and_flow_can_be_left_out(options: dict[str, Any]) -> None:
+    """Trained for a step and run on boxes with and without appearance and rectangle."""
+    torch.manual_seed(0)
+    tracker = Time3D(Spec(Boxes, 8, classes=SPEC.classes), width=32, layers=1, heads=4, **options)
+    frames = [found.replace(embedding=torch.randn(2, 8), box2d=torch.rand(2, 4) * 100)
+              for found in (boxes([(10, 0), (20, 5)]), boxes([(11, 0), (40, -5)]))]  # fmt: skip
+    for sequence in (frames, [boxes([(10, 0), (20, 5)]), boxes([(11, 0), (40, -5)])]):
+        output = tracker.train()(Boxes.cat(sequence, as_batch=True), [FrameMeta(str(t), "s", t, t / 10) for t in (0, 1)])
+        assert output.logits.isfinite().all()
+        assert [len(tracks.id) for tracks in follow(tracker.eval(), sequence)] == [2, 2]
+
+
+def test_motion_attributes_are_learned() -> None:
+    """From `Boxes.moving` of the labels: the one that drives on, and the parked ones."""
+    torch.manual_seed(0)
+    tracker, loss = Time3D(SPEC, width=32, layers=1, heads=4).train(), TemporalConsistencyLoss(SPEC, attribute=1.0)
+    truth = [boxes([(10 + t, 0), (20, 5)]) for t in range(3)]
+    known = Boxes.cat(truth, as_batch=True).replace(moving=torch.tensor([1, 0] * 3, dtype=torch.int8))
+    targets = Targets(boxes=known, tracks=Tracks(known, torch.tensor([5, 6] * 3)))
+    meta = [FrameMeta(str(t), "s", t, t / 10) for t in range(3)]
+    optimizer = torch.optim.AdamW(tracker.parameters(), 3e-3)
+    values = []
+    for _ in range(60):
+        term = loss(tracker(known, meta), targets)["attribute"]
+        values.append(float(term.detach()))
+        optimizer.zero_grad()
+        term.backward()
+        optimizer.step()
+    assert values[0] > 0.8
+    assert values[-1] < 0.2
+    unknown = known.replace(moving=torch.full((6,), -1, dtype=torch.int8))
+    assert float(loss(tracker(known, meta), Targets(tracks=Tracks(unknown, targets.tracks.id)))["attribute"]) == 0
+
+
+def test_boxes_of_pictures_are_matched_by_their_rectangles() -> None:
+    """Depth from a picture may be metres off: a box 6 m too far still stands for its object."""
+    truth = boxes([(20, 0)]).replace(box2d=torch.tensor([[100.0, 50, 160, 90]]))
+    far = boxes([(26, 0)]).replace(box2d=torch.tensor([[102.0, 51, 161, 91]]))
+    targets = Targets(tracks=Tracks(truth, torch.tensor([5])))
+    assert identities(far, targets).tolist() == [5]
+    assert identities(far.replace(box2d=None), targets).tolist() == [-1]
+    assert identities(far.replace(box2d=far.box2d + 200), targets).tolist() == [-1]
 
 
 def test_losses_without_pairs_labels_or_boxes_are_zero() -> None:
