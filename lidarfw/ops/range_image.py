@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations, product
 
 import torch
 from torch import Tensor
@@ -50,19 +50,35 @@ def residual_images(
     nearest: float = 0.0,
     farthest: float = float("inf"),
     signed: bool = False,
+    search: int = 0,
 ) -> Tensor:
     """(B, len(past), H, W) relative change of range `abs(r - r_past) / r`; 0 where a pixel has no point in one of both.
 
     Chen et al., "Moving Object Segmentation in 3D LiDAR Data" (RA-L 2021), equation 1. The past scans stand in
     the current sensor frame already. Only ranges between `nearest` and `farthest` metres count, on both sides.
-    `signed` gives `(r_past - r) / r`: positive where something has come in front of what was seen before.
+    `signed` gives `(r_past - r) / r`: positive where something has come in front of what was seen before. r_past is
+    the one nearest to r within `search` pixels on every side: beams of two scans never meet the same point, and beside
+    an edge, in leaves or at a grazing angle that alone changes the range from pixel to pixel.
     """
     now = _range_of(current)[:, None]
     before = torch.stack([_nearest_range(points, current.view) for points in past], 1)
+    before = _closest(before, now, search)
     both = current.mask[:, None] & torch.isfinite(before)
     both &= (now > nearest) & (now < farthest) & (before > nearest) & (before < farthest)
     change = (before - now) / now.clamp(min=1e-6)
     return torch.where(both, change if signed else change.abs(), 0)
+
+
+def _closest(ranges: Tensor, wanted: Tensor, search: int) -> Tensor:
+    """(B, n, H, W) of the ranges within `search` pixels the one nearest to the wanted (B, 1, H, W); columns go round."""
+    height, width = ranges.shape[2:]
+    around = _surround(ranges, search, torch.inf)
+    best, least = ranges, (ranges - wanted).abs()
+    for row, column in product(range(2 * search + 1), repeat=2):
+        other = around[..., row : row + height, column : column + width]
+        apart = (other - wanted).abs()
+        best, least = torch.where(apart < least, other, best), torch.minimum(apart, least)
+    return best
 
 
 def _nearest_range(points: Points, view: RangeView) -> Tensor:

@@ -119,7 +119,7 @@ def take(record: Any, number: int) -> Any:
 
 
 def _take_range_image(record: RangeImage, number: int) -> RangeImage:
-    size = record.view.height * record.view.width
+    size = record.mask[0].numel()  # a sector of the view has fewer pixels
     # a point outside the view has no sample: only points inside are kept
     pixel = record.pixel[(record.pixel >= number * size) & (record.pixel < (number + 1) * size)] - number * size
     one = slice(number, number + 1)
@@ -144,7 +144,7 @@ def _collate_records(records: Sequence[Any]) -> Any:
 
 
 def _collate_range_images(records: Sequence[RangeImage]) -> RangeImage:
-    size = records[0].view.height * records[0].view.width
+    size = records[0].mask[0].numel()
     starts = [size * sum(r.batch_size for r in records[:i]) for i in range(len(records))]
     pixel = torch.cat([torch.where(r.pixel < 0, -1, r.pixel + s) for r, s in zip(records, starts, strict=True)])
     features, xyz, mask = (torch.cat([getattr(r, n) for r in records]) for n in ("features", "xyz", "mask"))

@@ -114,6 +114,20 @@ def test_residuals_between_ranges_only(signed: bool) -> None:
     assert residual[image.pixel].tolist() == pytest.approx([sign * 0.2, 0.1, 0, 0], abs=1e-4)
 
 
+def test_residuals_against_the_nearest_range_around_a_pixel() -> None:
+    rows, columns = torch.meshgrid(torch.arange(8), torch.arange(32), indexing="ij")
+    ahead = VIEW.direction(rows.flatten(), columns.flatten())
+    now, before = (torch.full((8, 32), 10.0) for _ in range(2))
+    before[:, 1:4] = 20.0  # three columns wide: further than one pixel reaches in their middle only
+    before[:, 31] = 10.5
+    now[:, 0] = 10.5  # the column on the other side of the border
+    scans = [Points.from_scan(ahead * r.flatten()[:, None], ahead[:, :0]) for r in (now, before)]
+    image = range_project(scans[0], VIEW)
+    plain, searched = (residual_images(image, [scans[1]], search=n)[0, 0] for n in (0, 1))
+    assert plain[3, [0, 1, 2, 3, 4]].tolist() == pytest.approx([0.5 / 10.5, 1, 1, 1, 0], abs=1e-4)
+    assert searched[3, [0, 1, 2, 3, 4]].tolist() == pytest.approx([0, 0, 1, 0, 0], abs=1e-4)
+
+
 def test_a_clipping_view_keeps_what_lies_above_and_below() -> None:
     steep = torch.tensor([[1.0, 0, 5], [1, 0, -5], [5, 0, 0], [0, 0, 0]])
     for clip, rows in ((False, [-1, -1, 3, -1]), (True, [0, 7, 3, -1])):

@@ -56,6 +56,7 @@ class Seen:
     labels: PointLabels
     truth: Tensor  # (N,) int64: 1 moving, 0 static, -1 unknown
     pose: Poses | None
+    counts: bool = True  # in figures; the filter sees every frame
 
 
 @dataclass
@@ -94,14 +95,17 @@ class Figures:
         return {name: part / whole if whole else float("nan") for name, (part, whole) in ratios.items()}
 
 
-def predictions(checkpoint: Path, overrides: Sequence[str]) -> Iterator[Seen]:
-    """The unfiltered predictions of a checkpoint on the test split of its config, changed by `overrides`."""
+def predictions(checkpoint: Path, overrides: Sequence[str], past: int = 0) -> Iterator[Seen]:
+    """The unfiltered predictions of a checkpoint on the test split of its config, changed by `overrides`.
+
+    Frames with fewer than `past` scans of the sequence before them do not count.
+    """
     about = description(read(checkpoint), checkpoint)
     config = evaluation_config(config_of(about, checkpoint), list(overrides))
     model = lidarfw.load(checkpoint)
     dataset, transforms = make_dataset(config, config.splits.test), make_transforms(config, training=False)
     dataset.prepare()
-    for index in itertools.chain.from_iterable(dataset.sequences()):
+    for place, index in itertools.chain.from_iterable(map(enumerate, dataset.sequences())):
         frame = dataset[index]
         for change in transforms:
             frame = change(frame, np.random.default_rng(0))
@@ -111,7 +115,7 @@ def predictions(checkpoint: Path, overrides: Sequence[str]) -> Iterator[Seen]:
         if labelled is None:
             raise DataError(f"frame {frame.meta.id} has no labels")
         pose = next((v for v in frame.inputs.values() if isinstance(v, Poses)), None)
-        yield Seen(result, frame.inputs["points"], result.of(PointLabels), labelled.label, pose)
+        yield Seen(result, frame.inputs["points"], result.of(PointLabels), labelled.label, pose, place >= past)
 
 
 def filtered(frames: Sequence[Seen], part: BayesFilter) -> list[Tensor]:
@@ -133,6 +137,8 @@ def figures(frames: Sequence[Seen], moving: Sequence[Tensor]) -> dict[str, float
     """All rates for labels (N,) bool of every frame, in order of time."""
     total = Figures()
     for number, (seen, label) in enumerate(zip(frames, moving, strict=True)):
+        if not seen.counts:
+            continue
         total.add(seen, label)
         if number and frames[number - 1].result.meta.sequence == seen.result.meta.sequence:
             _count_flips(total, frames[number - 1], moving[number - 1], seen, label)
@@ -199,7 +205,7 @@ def study(frames: Sequence[Seen], adaptive: tuple[float, ...] = ()) -> dict[str,
     raw = [seen.labels.probability[:, 1] for seen in frames]
     table = {"no filter": figures(frames, [p > 0.5 for p in raw])}
     for options in settings(adaptive):
-        part = _filter(frames[0], options)
+        part = make_filter(frames[0], options)
         name = ", ".join(f"{key} {_short(value)}" for key, value in options.items())
         table[name] = figures(frames, [p > 0.5 for p in filtered(frames, part)])
         threshold = matched_threshold(options.get("prior", 0.25), options.get("window", 2))
@@ -208,7 +214,8 @@ def study(frames: Sequence[Seen], adaptive: tuple[float, ...] = ()) -> dict[str,
     return table
 
 
-def _filter(seen: Seen, options: dict[str, Any]) -> BayesFilter:
+def make_filter(seen: Seen, options: dict[str, Any]) -> BayesFilter:
+    """The filter with these options, for frames such as this one."""
     from lidarfw.types import DataSpec, Spec
 
     image = next((v for v in seen.result.inputs.values() if isinstance(v, RangeImage)), None)
@@ -222,18 +229,8 @@ def _short(value: Any) -> str:
     return "(" + " ".join(f"{v:.2f}" for v in value) + ")" if isinstance(value, tuple) else str(value)
 
 
-def residual_baseline(frames: Sequence[Seen], threshold: float) -> dict[str, float]:
-    """No learning: a point moves where the first residual image exceeds a threshold."""
-    labels = []
-    for seen in frames:
-        image = next(v for v in seen.result.inputs.values() if isinstance(v, RangeImage))
-        residual = image.features[0, 2].abs().flatten()
-        labels.append((image.pixel >= 0) & (residual[image.pixel.clamp(min=0)] > threshold))
-    return figures(frames, labels)
-
-
-def movable_baseline(frames: Sequence[Seen], root: str, split: str) -> dict[str, float]:
-    """True classes, no motion: everything that could move is taken to move."""
+def movable_points(frames: Sequence[Seen], root: str, split: str) -> list[Tensor]:
+    """(N,) bool of every frame: points of classes that can move, by the true classes."""
     dataset = SemanticKittiDataset(root=root, split=split, task="semantics")
     movable = torch.tensor([name in MOVABLE for name in dataset.spec.classes] + [False])
     found = {}
@@ -241,7 +238,7 @@ def movable_baseline(frames: Sequence[Seen], root: str, split: str) -> dict[str,
         frame = dataset[index]
         if frame.targets.points is not None:
             found[frame.meta.id] = movable[frame.targets.points.label]
-    return figures(frames, [found[seen.result.meta.id] for seen in frames])
+    return [found[seen.result.meta.id] for seen in frames]
 
 
 def markdown(table: dict[str, dict[str, float]]) -> str:
@@ -259,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("overrides", nargs="*", help="as for lidarfw eval, e.g. splits.test=val")
     parser.add_argument("--prior-split", help="split of the same data that the adaptive prior is fitted on")
-    parser.add_argument("--residual", type=float, default=0.05, help="threshold of the residual baseline (%(default)s)")
+    parser.add_argument("--past", type=int, default=0, help="count frames with so many scans before them (%(default)s)")
     parser.add_argument(
         "--semantics", nargs=2, metavar=("ROOT", "SPLIT"), help="SemanticKITTI: baseline of true classes"
     )
@@ -268,11 +265,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     adaptive: tuple[float, ...] = ()
     if args.prior_split:
         adaptive = fit_prior(list(predictions(args.checkpoint, [*args.overrides, f"splits.test={args.prior_split}"])))
-    frames = [_light(seen) for seen in predictions(args.checkpoint, args.overrides)]
+    frames = [_light(seen) for seen in predictions(args.checkpoint, args.overrides, args.past)]
     table = study(frames, adaptive)
-    table[f"residual above {args.residual:g}"] = residual_baseline(frames, args.residual)
     if args.semantics:
-        table["all that can move moves (true classes)"] = movable_baseline(frames, *args.semantics)
+        movable = movable_points(frames, *args.semantics)
+        table["all that can move moves (true classes)"] = figures(frames, movable)
     print(markdown(table))
     if args.json:
         write_text(args.json, json.dumps(table, indent=1) + "\n")

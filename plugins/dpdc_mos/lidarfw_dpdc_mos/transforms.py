@@ -24,6 +24,7 @@ else:
 
 IMAGE = "range"  # name of the input that `range_projection` adds
 FOV_POLICIES = ("clip", "drop")
+_STRIDE = 16  # of the coarsest map of the paper's network
 
 
 class RangeProjection(Transform):
@@ -86,16 +87,20 @@ class ResidualImages(Transform):
         max_range: float = 50.0,
         limit: float = 5.0,
         signed: bool = False,
+        search: int = 0,
         max_gap: float = 0.5,
     ) -> None:
         """Options: how many residual images, and every how manieth past scan they compare with; ranges in metres;
-        signed: (r_past - r) / r instead, which tells what appeared from what went away; max_gap in seconds."""
-        if count < 0 or stride < 1:
-            raise ConfigError(f"residual_images: expected count >= 0 and stride >= 1, found {count} and {stride}")
+        signed: (r_past - r) / r instead, which tells what appeared from what went away; search: r_past is the nearest
+        to r of the pixels so far around (0: the paper's, the same pixel); max_gap in seconds."""
+        if count < 0 or stride < 1 or search < 0:
+            raise ConfigError(
+                f"residual_images: expected count >= 0, stride >= 1 and search >= 0, found {count}, {stride}, {search}"
+            )
         if not 0 <= min_range < max_range:
             raise ConfigError(f"residual_images: expected 0 <= min_range < max_range, found {min_range}, {max_range}")
         self.count, self.stride, self.limit, self.signed, self.max_gap = count, stride, limit, signed, max_gap
-        self.min_range, self.max_range = min_range, max_range
+        self.min_range, self.max_range, self.search = min_range, max_range, search
 
     def spec(self, data: DataSpec) -> DataSpec:
         """With `count` more features. ConfigError without a range image, or with too few scans per frame."""
@@ -133,7 +138,9 @@ class ResidualImages(Transform):
         result = image.features.new_zeros(1, self.count, height, width)
         past = self._past(points)
         if past:
-            found = residual_images(image, past, nearest=self.min_range, farthest=self.max_range, signed=self.signed)
+            found = residual_images(
+                image, past, nearest=self.min_range, farthest=self.max_range, signed=self.signed, search=self.search
+            )
             result[:, : len(past)] = found.clamp(-self.limit, self.limit)
         return result
 
@@ -141,7 +148,7 @@ class ResidualImages(Transform):
         """The past scans that there are, `stride` apart, most recent first."""
         if points.time is None:
             return []
-        times = torch.unique(points.time).flip(0)
+        times = torch.unique(torch.unique_consecutive(points.time)).flip(0)  # scan after scan: much faster
         joined = (-times.diff() <= self.max_gap).cumprod(0)
         reach = 1 + int(joined.sum())
         chosen = times[: min(reach, self.count * self.stride + 1) : self.stride][1:]
@@ -187,6 +194,65 @@ class EdgeDistance(Transform):
         return frame.replace(targets=frame.targets.replace(pixels=image.replace(features=maps)))
 
 
+class RangeCrop(Transform):
+    """In training, a sector of `columns` columns of the range image with its points, labels and distance maps.
+
+    Little of a scan moves: with the share `moving` the sector holds a random point of a class other than the first,
+    where there is one; else it lies anywhere. Networks that fit a sector fit the full turn, so that evaluation sees
+    all of it.
+    """
+
+    train_only = True
+    follows = ("range_projection", "residual_images", "edge_distance")
+
+    def __init__(self, *, columns: int = 256, moving: float = 0.75) -> None:
+        if columns < 1 or columns % _STRIDE:
+            raise ConfigError(f"range_crop.columns must be a multiple of {_STRIDE}, for networks that halve the width")
+        if not 0 <= moving <= 1:
+            raise ConfigError(f"range_crop.moving is a share, expected 0..1, found {moving}")
+        self.columns, self.moving = columns, moving
+
+    def spec(self, data: DataSpec) -> DataSpec:
+        """Unchanged. ConfigError without a range image, or one narrower than the sector."""
+        view = data.inputs[IMAGE].geometry if IMAGE in data.inputs else None
+        if not isinstance(view, RangeView):
+            raise ConfigError("range_crop needs the range image.\n  fix: transform=[...,range_projection,range_crop]")
+        if view.width < self.columns:
+            raise ConfigError(
+                f"range_crop.columns is {self.columns}, the range image has {view.width}.\n"
+                f"  fix: transform.range_crop.columns={view.width // 2 // _STRIDE * _STRIDE}"
+            )
+        return data
+
+    def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        """The frame with a narrower range image, and the points in it."""
+        image: RangeImage = frame.inputs[IMAGE]
+        width = image.mask.shape[2]
+        first = self._first(frame, width, rng)
+        place = (image.pixel % width - first) % width
+        kept = (image.pixel >= 0) & (place < self.columns)
+        pixel = image.pixel[kept] // width * self.columns + place[kept]
+        chosen = (torch.arange(self.columns) + first) % width
+        values = {name: getattr(image, name)[..., chosen] for name in ("features", "xyz", "mask")}
+        labels, maps = frame.targets.points, frame.targets.pixels
+        targets = frame.targets.replace(
+            points=None if labels is None else labels[kept],
+            pixels=None if maps is None else maps.replace(features=maps.features[..., chosen]),
+        )
+        inputs = {**frame.inputs, "points": frame.inputs["points"][kept], IMAGE: image.replace(**values, pixel=pixel)}
+        return frame.replace(inputs=inputs, targets=targets)
+
+    def _first(self, frame: Frame, width: int, rng: np.random.Generator) -> int:
+        """The leftmost column."""
+        labels = frame.targets.points
+        pixel = frame.inputs[IMAGE].pixel
+        wanted = pixel[:0] if labels is None else pixel[(labels.label > 0) & (pixel >= 0)]
+        if len(wanted) == 0 or rng.random() >= self.moving:
+            return int(rng.integers(width))
+        middle = int(wanted[int(rng.integers(len(wanted)))]) % width
+        return (middle - int(rng.integers(self.columns))) % width
+
+
 def _current(points: Points) -> Tensor:
     """(N,) bool: points of the current scan."""
     return torch.ones_like(points.batch, dtype=torch.bool) if points.time is None else points.time >= 0
@@ -200,4 +266,4 @@ def _points_spec(data: DataSpec) -> Spec:
     return spec
 
 
-__all__ = ["EdgeDistance", "RangeProjection", "ResidualImages"]
+__all__ = ["EdgeDistance", "RangeCrop", "RangeProjection", "ResidualImages"]

@@ -10,11 +10,11 @@ import torch
 from lidarfw.components.transforms.augmentation import RandomFlip, RandomRotation
 from lidarfw.errors import ConfigError
 from lidarfw.testing.synthetic import SyntheticDataset
-from lidarfw.types import DataSpec, Frame, FrameMeta, PointLabels, Points, RangeImage, Spec, Targets
+from lidarfw.types import DataSpec, Frame, FrameMeta, PointLabels, Points, RangeImage, Spec, Targets, collate
 from torch import Tensor
 
 from lidarfw_dpdc_mos.distance import on_pixels
-from lidarfw_dpdc_mos.transforms import EdgeDistance, RangeProjection, ResidualImages
+from lidarfw_dpdc_mos.transforms import EdgeDistance, RangeCrop, RangeProjection, ResidualImages
 
 RNG = np.random.default_rng(0)
 
@@ -22,7 +22,7 @@ RNG = np.random.default_rng(0)
 def frame(xyz: list[list[float]], time: list[float] | None = None, label: list[int] | None = None) -> Frame:
     """A frame of these points, remission 0.5."""
     points = Points.from_scan(
-        torch.tensor(xyz), torch.full((len(xyz), 1), 0.5), None if time is None else torch.tensor(time)
+        torch.tensor(xyz).view(-1, 3), torch.full((len(xyz), 1), 0.5), None if time is None else torch.tensor(time)
     )
     known = None
     if label is not None:
@@ -75,6 +75,48 @@ def test_residuals() -> None:
         [0.1, 0.025, 0, 3 / 51, 0.1 / 1.5, 0.5], abs=1e-5
     )
     assert residuals([3, 10], [30, 10], limit=5) == pytest.approx([5, 0], abs=1e-5)
+
+
+def test_residuals_against_the_nearest_range_around() -> None:
+    """The past scan is half a pixel off at an edge: within one pixel it has the same range, on the pixel it has not."""
+    step = 360 / 2048
+    now = [(at(0, 10), 0.0), (at(step, 10), 0.0), (at(5 * step, 10), 0.0)]
+    past = [(at(0, 20), -0.1), (at(step, 10), -0.1), (at(5 * step, 20), -0.1)]
+    projected = RangeProjection()(frame([p for p, _ in now + past], [t for _, t in now + past]), RNG)
+    for search, expected in ((0, [1, 0, 1]), (1, [0, 0, 1])):
+        image = ResidualImages(count=1, search=search)(projected, RNG).inputs["range"]
+        assert image.features[0, 2].flatten()[image.pixel].tolist() == pytest.approx(expected, abs=1e-4)
+
+
+def test_a_sector_keeps_what_is_in_it() -> None:
+    """Features, points, labels and distance maps of a sector are those of the full turn, also across its border."""
+    degrees = [-179, -178, -90, 0, 90, 178, 179]
+    given = frame([at(a, 10 + abs(a) / 100) for a in degrees], label=[0, 0, 0, 0, 0, 0, 1])
+    whole = EdgeDistance()(RangeProjection(height=16, width=256)(given, RNG), RNG)
+    cut = RangeCrop(columns=32, moving=1.0)(whole, np.random.default_rng(2))
+    image, points, labels = cut.inputs["range"], cut.inputs["points"], cut.targets.points
+    assert image.features.shape == (1, 2, 16, 32)
+    assert labels is not None
+    assert 1 in labels.label.tolist()
+    assert 1 < len(points) < len(degrees)
+    assert image.features[0, 0].flatten()[image.pixel].tolist() == pytest.approx(points.xyz.norm(dim=1).tolist())
+    assert cut.targets.pixels is not None
+    assert whole.targets.pixels is not None
+    assert cut.targets.pixels.features.shape == (1, 1, 16, 32)
+    of_moving = int(image.pixel[labels.label == 1])
+    assert cut.targets.pixels.features.flatten()[of_moving] == 0
+    both = collate([cut, cut])
+    assert both.inputs["range"].pixel.tolist() == [*image.pixel.tolist(), *(image.pixel + 16 * 32).tolist()]
+
+
+def test_sectors_without_what_moves_lie_anywhere() -> None:
+    given = RangeProjection(width=256)(frame([at(a, 10) for a in range(0, 360, 4)], label=[0] * 90), RNG)
+    crop, rng = RangeCrop(columns=64), np.random.default_rng(0)
+    first = {float(crop(given, rng).inputs["points"].xyz[0, 1]) for _ in range(8)}
+    assert len(first) > 4
+    assert len(RangeCrop(columns=256)(given, rng).inputs["points"]) == 90
+    empty = RangeProjection(width=256)(frame([]), RNG)
+    assert len(crop(empty, rng).inputs["points"]) == 0
 
 
 def test_strides_gaps_and_the_start_of_a_sequence() -> None:
@@ -148,5 +190,15 @@ def test_errors_say_what_to_do() -> None:
         EdgeDistance().spec(data)
     with pytest.raises(ConfigError, match="clip, drop"):
         RangeProjection(fov_policy="keep")
+    with pytest.raises(ConfigError, match="multiple of 16"):
+        RangeCrop(columns=100)
+    with pytest.raises(ConfigError, match="columns=32"):
+        RangeCrop(columns=128).spec(RangeProjection(width=64).spec(data))
+    with pytest.raises(ConfigError, match="range_projection,range_crop"):
+        RangeCrop().spec(data)
+    with pytest.raises(ConfigError, match="0..1, found 2"):
+        RangeCrop(moving=2.0)
+    with pytest.raises(ConfigError, match="search >= 0"):
+        ResidualImages(search=-1)
     with pytest.raises(ConfigError, match="needs the input `points`"):
         RangeProjection().spec(DataSpec())
