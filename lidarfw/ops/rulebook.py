@@ -9,7 +9,7 @@ never wraps to another line; the order of the keys is the canonical order.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 
@@ -25,6 +25,7 @@ Triple = tuple[int, int, int]
 
 _TABLE = 2**22  # chunks of the key space that the first lookup table counts: 16 MB
 _BLOCK_PAIRS = 2**16  # pairs computed at a time: their products, 16 MB at 64 channels, stay in the cache
+_BATCH_PAIRS = 2**14  # pairs whose rows are gathered by one call, where several kernel elements have so few
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,20 @@ class Kernel:
 
 
 @dataclass
+class Batch:
+    """Pairs under a few kernel elements, side by side: their rows are gathered by one call."""
+
+    inputs: Tensor  # (pairs,) int32 input rows, by element
+    outputs: Tensor  # (pairs,) int32 output rows
+    elements: tuple[int, ...]  # kernel elements
+    sizes: tuple[int, ...]  # pairs of each element
+
+    @property
+    def pairs(self) -> int:
+        return len(self.inputs)
+
+
+@dataclass
 class Block:
     """A run of output rows and the pairs that reach them: what is computed at a time.
 
@@ -56,16 +71,18 @@ class Block:
     """
 
     rows: slice  # output rows
-    inputs: tuple[Tensor, ...]  # input rows of each run of pairs under one kernel element
-    outputs: tuple[Tensor, ...]  # output rows of each run
-    elements: tuple[int, ...]  # kernel element of each run
-    sizes: tuple[int, ...]  # pairs in each run
+    batches: tuple[Batch, ...]
     order: Tensor  # (pairs,) int32 pairs of the block sorted by output row
     starts: Tensor  # (rows + 1,) int32: row r of the block owns order[starts[r]:starts[r + 1]]
 
     @property
     def pairs(self) -> int:
-        return sum(self.sizes)
+        return len(self.order)
+
+    @property
+    def largest(self) -> int:
+        """Pairs of the largest batch."""
+        return max((batch.pairs for batch in self.batches), default=0)
 
 
 @dataclass
@@ -122,7 +139,9 @@ class Rulebook:
         return self._blocks
 
     def _mirrored(self, block: Block) -> Block:
-        return replace(block, elements=tuple(self.volume - 1 - element for element in block.elements))
+        mirror = [tuple(self.volume - 1 - element for element in batch.elements) for batch in block.batches]
+        batches = (replace(b, elements=elements) for b, elements in zip(block.batches, mirror, strict=True))
+        return replace(block, batches=tuple(batches))
 
     def _run_sizes(self, first_rows: Tensor) -> Tensor:
         """(groups, blocks) int64 pairs of each group that reach the rows of each block."""
@@ -137,13 +156,32 @@ class Rulebook:
         self, rows: slice, inputs: Sequence[Tensor], outputs: Sequence[Tensor], sizes: Sequence[int], starts: Tensor
     ) -> Block:
         runs = [run for run in zip(inputs, outputs, self.elements, sizes, strict=True) if run[-1]]
-        runs = runs or [(self.inputs[:0], self.outputs[:0], 0, 0)]
-        inputs, outputs, elements, sizes = zip(*runs, strict=True)
-        local = torch.cat(outputs)
+        batches = tuple(_batch(some) for some in _batched(runs))
+        local = torch.cat([self.outputs[:0], *(batch.outputs for batch in batches)])
         if rows.stop - rows.start < 2**15:  # fewer digits for the radix sort
             local = (local - rows.start).short()
         order, own = torch.sort(local, stable=True)[1].int(), starts[rows.start : rows.stop + 1]
-        return Block(rows, inputs, outputs, elements, sizes, order, (own - own[0]).int())
+        return Block(rows, batches, order, (own - own[0]).int())
+
+
+_Run = tuple[Tensor, Tensor, int, int]  # inputs, outputs, kernel element, pairs
+
+
+def _batched(runs: Sequence[_Run]) -> Iterator[list[_Run]]:
+    """The runs in order, as many together as make `_BATCH_PAIRS` pairs at most, but at least one."""
+    batch: list[_Run] = []
+    for run in runs:
+        if batch and sum(size for *_, size in batch) + run[-1] > _BATCH_PAIRS:
+            yield batch
+            batch = []
+        batch.append(run)
+    if batch:
+        yield batch
+
+
+def _batch(runs: Sequence[_Run]) -> Batch:
+    inputs, outputs, elements, sizes = zip(*runs, strict=True)
+    return Batch(torch.cat(inputs), torch.cat(outputs), elements, sizes)
 
 
 @dataclass

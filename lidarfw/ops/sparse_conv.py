@@ -13,6 +13,8 @@ Weights are (kernel volume, C_in, C_out), elements in z, y, x order: the dense `
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import accumulate
 from typing import Any, cast
 
 import torch
@@ -22,7 +24,7 @@ from torch.nn import functional as F
 
 from lidarfw.errors import LidarfwError
 from lidarfw.ops.product import multiply, padded
-from lidarfw.ops.rulebook import Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
+from lidarfw.ops.rulebook import Batch, Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
 from lidarfw.ops.scratch import scratch
 from lidarfw.types import Voxels
 
@@ -43,11 +45,11 @@ def convolve(
     output = features.new_empty(book.num_outputs, weight.shape[2])
     for block in blocks:
         products = scratch("products", block.pairs, weight.shape[2], features)
-        rows = scratch("rows", padded(max(block.sizes)), weight.shape[1], features)
-        runs = zip(block.inputs, block.sizes, block.elements, products.split_with_sizes(block.sizes), strict=True)
-        for inputs, size, element, product in runs:
-            torch.index_select(features, 0, inputs, out=rows[:size])
-            multiply(rows, weights[element], product)
+        rows = scratch("rows", block.largest + padded(1), weight.shape[1], features)  # the last run is padded too
+        for done, batch in _batches(block):
+            torch.index_select(features, 0, batch.inputs, out=rows[: batch.pairs])
+            for start, element, product in _runs(batch, products[done : done + batch.pairs]):
+                multiply(rows[start:], weights[element], product)
         total = sum_block(block, products)
         if book.symmetric:
             total.addmm_(features[block.rows], weights[book.volume // 2])
@@ -118,16 +120,27 @@ def _block_gradients(
     d_weight: Tensor | None,
 ) -> None:
     """Fill the products (pairs, C_in) that sum to the gradient of the features; add to the gradient of the weight."""
-    arrived = scratch("rows", padded(max(block.sizes)), gradient.shape[1], gradient)
-    seen = scratch("features", max(block.sizes), features.shape[1], features)
-    start = 0
-    for inputs, outputs, size, element in zip(block.inputs, block.outputs, block.sizes, block.elements, strict=True):
-        rows = torch.index_select(gradient, 0, inputs, out=arrived[:size])
+    arrived = scratch("rows", block.largest + padded(1), gradient.shape[1], gradient)  # the last run is padded too
+    seen = scratch("features", block.largest, features.shape[1], features)
+    for done, batch in _batches(block):
+        rows = torch.index_select(gradient, 0, batch.inputs, out=arrived[: batch.pairs])
         if d_weight is not None:
-            d_weight[element].addmm_(torch.index_select(features, 0, outputs, out=seen[:size]).t(), rows)
+            torch.index_select(features, 0, batch.outputs, out=seen[: batch.pairs])
+            for start, element, own in _runs(batch, rows):
+                d_weight[element].addmm_(seen[start : start + len(own)].t(), own)
         if products is not None:
-            multiply(arrived, flipped[element], products[start : start + size])
-        start += size
+            for start, element, product in _runs(batch, products[done : done + batch.pairs]):
+                multiply(arrived[start:], flipped[element], product)
+
+
+def _batches(block: Block) -> Iterator[tuple[int, Batch]]:
+    """The batches, each with the number of pairs before it."""
+    return zip(accumulate((batch.pairs for batch in block.batches), initial=0), block.batches)
+
+
+def _runs(batch: Batch, rows: Tensor) -> Iterator[tuple[int, int, Tensor]]:
+    """Of each kernel element in the batch: where its rows start, the element, its rows."""
+    return zip(accumulate(batch.sizes, initial=0), batch.elements, rows.split_with_sizes(batch.sizes))
 
 
 def triple(value: int | tuple[int, int, int]) -> Triple:

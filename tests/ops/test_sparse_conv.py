@@ -68,7 +68,9 @@ def assert_same_gradients(ours: Tensor, expected: Tensor, inputs: list[Tensor]) 
 
 
 @pytest.mark.parametrize(("size", "dilation"), SUBMANIFOLD)
-@pytest.mark.parametrize("limits", [{}, {"_TABLE": 2**6}, {"_TABLE": 2}, {"_BLOCK_PAIRS": 32}], ids=str)
+@pytest.mark.parametrize(
+    "limits", [{}, {"_TABLE": 2**6}, {"_TABLE": 2}, {"_BLOCK_PAIRS": 32}, {"_BATCH_PAIRS": 8}], ids=str
+)
 def test_submanifold_equals_dense_convolution(size, dilation, limits: dict[str, int], monkeypatch) -> None:
     for name, value in limits.items():  # several chunks, binary search, several blocks
         monkeypatch.setattr(rulebook, name, value)
