@@ -1,4 +1,4 @@
-"""The command line: `lidarfw train|eval|predict|track|index|list|show|check|new|prepare|bench|claims|completion`."""
+"""The command line, `lidarfw COMMAND`; the commands are those of COMMANDS."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from types import ModuleType
 
 import lidarfw
 from lidarfw.errors import LidarfwError
@@ -18,6 +19,7 @@ COMMANDS = {
     "predict": "run a checkpoint on scans or images and write results and pictures",
     "track": "follow the boxes of any detector through a sequence and write the official result files",
     "index": "maps of place descriptors: build, search, judge",
+    "pseudo-label": "learn from a few labelled scans and many that are not",
     "list": "what is installed, by slot",
     "show": "how components would be wired, and how large the model is",
     "check": "test a plugin or component against the rules of its interface",
@@ -36,6 +38,10 @@ _EXAMPLES = """examples:
 """
 
 
+def _module(command: str) -> ModuleType:
+    return importlib.import_module(f"lidarfw.commands.{command.replace('-', '_')}")
+
+
 def parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """The parser of all commands; only the arguments of the `chosen` one are filled in."""
     top = argparse.ArgumentParser(
@@ -47,7 +53,7 @@ def parser(chosen: str | None = None) -> argparse.ArgumentParser:
         command = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
         command.add_argument("--debug", action="store_true", help="show the trace of an error")
         if name == chosen:
-            importlib.import_module(f"lidarfw.commands.{name}").add_arguments(command)
+            _module(name).add_arguments(command)
     return top
 
 
@@ -64,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; the exit code is 0, 1 (checks failed) or 2 (the user can mend it)."""
     args = parse(list(sys.argv[1:] if argv is None else argv))
     try:
-        return int(importlib.import_module(f"lidarfw.commands.{args.command}").run(args))
+        return int(_module(args.command).run(args))
     except LidarfwError as error:
         if args.debug or os.environ.get("HYDRA_FULL_ERROR") == "1":
             traceback.print_exc()

@@ -39,7 +39,8 @@ class FolderDataset(DriveDataset):
 
     A sequence is a folder of scans, or one with scans in points/. Beside them: poses.txt (LiDAR -> map, 12 numbers
     a scan), times.txt (seconds), boxes/NAME.txt (class x y z l w h yaw, and a track id), labels/NAME.label (uint32 a
-    point: 0 unlabelled, k the k-th class; instance in the upper 16 bits). All in lidarfw's conventions.
+    point: 0 unlabelled, k the k-th class; instance in the upper 16 bits). All in lidarfw's conventions. Where there is
+    ignored/NAME.txt, with lines as in boxes, its boxes are neither right nor wrong for their class.
     """
 
     def __init__(
@@ -154,11 +155,19 @@ class FolderDataset(DriveDataset):
 
     def _objects(self, scan: Path) -> Targets:
         """Boxes of the classes, and tracks where asked for."""
-        boxes, track = read_boxes(_beside(scan, "boxes", ".txt"), self.classes, tracks=self.tracks)
-        return Targets(boxes=boxes, tracks=Tracks(boxes, track) if self.tracks else None)
+        boxes, track = read_boxes(self.beside(scan, "boxes"), self.classes, tracks=self.tracks)
+        unclear = self.beside(scan, "ignored")
+        ignored = read_boxes(unclear, self.classes)[0] if unclear.is_file() else Boxes.empty()
+        return Targets(boxes=boxes, ignored=ignored, tracks=Tracks(boxes, track) if self.tracks else None)
+
+    @staticmethod
+    def beside(scan: Path, kind: str, suffix: str = ".txt") -> Path:
+        """The file of a kind (boxes, ignored, labels) that belongs to a scan, whether it is there or not."""
+        folder = scan.parent.parent if scan.parent.name == "points" else scan.parent
+        return folder / kind / f"{scan.stem}{suffix}"
 
     def _point_labels(self, files: list[Path], scans: list[Points]) -> PointLabels:
-        parts = [self._ids(_beside(file, "labels", ".label"), len(scan)) for file, scan in zip(files, scans)]
+        parts = [self._ids(self.beside(file, "labels", ".label"), len(scan)) for file, scan in zip(files, scans)]
         raw = np.concatenate(parts)
         label = torch.from_numpy((raw & 0xFFFF).astype(np.int64)) - 1
         probability = (label[:, None] == torch.arange(len(self.classes))).float()
@@ -203,8 +212,3 @@ def _scans(folder: Path) -> list[Path]:
         if first.stem == second.stem:
             raise DataError(f"{first} and {second.name}: a frame goes by its name, expected one file of each")
     return files
-
-
-def _beside(scan: Path, kind: str, suffix: str) -> Path:
-    folder = scan.parent.parent if scan.parent.name == "points" else scan.parent
-    return folder / kind / f"{scan.stem}{suffix}"
