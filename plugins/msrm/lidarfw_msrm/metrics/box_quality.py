@@ -1,0 +1,175 @@
+"""How well boxes sit on the objects that were found, and what is found, by distance and visibility.
+
+Two detectors of equal average precision may differ in how tight their boxes are; refinement is about that.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from lidarfw.components.matching import greedy_match
+from lidarfw.components.metrics.box_ap import FALSE, IGNORED, TRUE, USUAL_IOU, average_precision
+from lidarfw.components.per_class import per_class
+from lidarfw.interfaces import Metric
+from lidarfw.ops import iou_3d
+from lidarfw.types import Boxes, Spec, Targets
+from torch import Tensor
+
+BINS: dict[str, tuple[float, float]] = {"near": (0, 20), "middle": (20, 40), "far": (40, math.inf)}  # metres
+VISIBILITY = {"visible": 0, "partly": 1, "largely": 2}  # occlusion as labelled
+QUALITIES = ("iou", "center", "yaw", "recall")
+LABEL, SCORE, VERDICT, RANGE, OCCLUSION, MATCHED, IOU, CENTER, YAW = range(9)  # columns of a detection
+
+
+class BoxQuality(Metric):
+    """Overlap and errors of the boxes that match an object, and average precision, by distance and visibility.
+
+    By falling score each detection takes the free object of its class with the highest 3D IoU of at least `matched`;
+    of these pairs are `{class}_iou`, the mean IoU, `{class}_center`, metres between the centres, `{class}_yaw`,
+    radians between the axes (a box may point either way), and `{class}_recall`, the share of objects in a pair. The
+    mean over classes is called `mean_...`.
+
+    `{class}_ap_{bin}` is the average precision of `box_ap` at the IoU of `iou` (Car 0.7, Pedestrian and Cyclist 0.5
+    where not given), `{class}_iou_{bin}` the mean IoU, of the objects of a bin: near (up to 20 m), middle (to 40 m),
+    far; visible, partly, largely, where occlusion is labelled. False detections count in the bin of their own
+    distance, and in all bins of visibility. `{class}_objects_{bin}` is the number of objects.
+
+    Detections that hit an ignored object count neither for nor against. Frames without box labels are not counted.
+    """
+
+    monitor: ClassVar[str] = "mean_iou"
+    higher_is_better = True
+    full_state_update = False
+    detections: list[Tensor]  # (N, 9) see the columns above
+    objects: list[Tensor]  # (M, 3) label, range, occlusion
+
+    def __init__(
+        self, boxes: Spec, *, matched: float = 0.3, iou: dict[str, float] | None = None, default_iou: float = 0.5
+    ) -> None:
+        super().__init__()
+        usual = {name: value for name, value in USUAL_IOU.items() if name in boxes.classes}
+        self.classes, self.matched = boxes.classes, matched
+        self.iou = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "iou")
+        self.add_state("detections", default=[], dist_reduce_fx="cat")
+        self.add_state("objects", default=[], dist_reduce_fx="cat")
+        self._start()
+
+    def _start(self) -> None:
+        # never an empty list: processes that saw no frame must take part in the exchange of the others
+        self.detections.append(torch.zeros(0, 9, device=self.device))
+        self.objects.append(torch.zeros(0, 3, device=self.device))
+
+    def reset(self) -> None:
+        """Forget all counts."""
+        super().reset()
+        self._start()
+
+    def update(self, boxes: Boxes, targets: Targets) -> None:
+        """Count the detections of one frame, or of a batch of frames, in."""
+        if targets.boxes is None:
+            return
+        truth = targets.boxes
+        ignored = Boxes.empty(device=truth.batch.device) if targets.ignored is None else targets.ignored
+        boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
+        overlap, fits = _overlap(boxes, truth, ignored[(ignored.size > 0).all(1)])
+        strict = overlap.new_tensor(self.iou)[boxes.label][:, None]
+        judged = _taken(overlap, fits & (overlap >= strict), len(truth))
+        paired = _taken(overlap, fits & (overlap >= self.matched), len(truth))
+        self.detections.append(_rows(boxes, truth, overlap, judged, paired).to(self.device))
+        self.objects.append(torch.stack([truth.label.float(), _range(truth), _occlusion(truth)], 1).to(self.device))
+
+    def compute(self) -> dict[str, Any]:
+        """The figures, as floats."""
+        # after an exchange between processes the state is one tensor instead of a list
+        rows, objects = (
+            torch.cat(state) if isinstance(state, list) else state for state in (self.detections, self.objects)
+        )
+        figures: dict[str, float] = {}
+        means: dict[str, list[float]] = {name: [] for name in QUALITIES}
+        for label, name in enumerate(self.classes):
+            mine, there = rows[rows[:, LABEL] == label], objects[objects[:, 0] == label]
+            if len(there) == 0:
+                continue
+            key = name.lower().replace(" ", "_")
+            whole = _quality(mine, len(there))
+            figures |= {f"{key}_{what}": value for what, value in (whole | _by_bin(mine, there)).items()}
+            for what, value in whole.items():
+                means[what].append(value)
+        known = {what: [v for v in values if not math.isnan(v)] for what, values in means.items()}
+        return figures | {f"mean_{what}": sum(v) / len(v) if v else math.nan for what, v in known.items()}
+
+
+def _overlap(boxes: Boxes, truth: Boxes, ignored: Boxes) -> tuple[Tensor, Tensor]:
+    """3D IoU (N, M) of detections with objects, ignored ones last, and whether they are of one frame and class."""
+    label, batch = torch.cat([truth.label, ignored.label]), torch.cat([truth.batch, ignored.batch])
+    overlap = iou_3d(boxes.tensor.double(), torch.cat([truth.tensor, ignored.tensor]).double())
+    fits = (boxes.label[:, None] == label) | (label == -1)
+    return overlap, fits & (boxes.batch[:, None] == batch)
+
+
+def _taken(overlap: Tensor, fits: Tensor, count: int) -> Tensor:
+    """Column (N,) that each row takes, in their order, -1 none; the first `count` columns come before the others."""
+    first = torch.arange(overlap.shape[1], device=overlap.device) < count
+    return greedy_match(torch.where(fits, overlap + first * 2, -torch.inf))
+
+
+def _rows(boxes: Boxes, truth: Boxes, overlap: Tensor, judged: Tensor, paired: Tensor) -> Tensor:
+    """(N, 9) of the detections."""
+    count = len(truth)
+    verdict = torch.where(judged >= 0, IGNORED, FALSE)
+    verdict[(judged >= 0) & (judged < count)] = TRUE
+    matched = (paired >= 0) & (paired < count)
+    hit = torch.where((judged >= 0) & (judged < count), judged, torch.where(matched, paired, -1))
+    distance, occlusion = _range(boxes), torch.full_like(boxes.score, -1)
+    iou, center, yaw = (torch.full_like(boxes.score, math.nan) for _ in range(3))
+    if count:
+        at = hit.clamp(min=0)
+        distance = torch.where(hit >= 0, _range(truth)[at], distance)
+        occlusion = torch.where(hit >= 0, _occlusion(truth)[at], occlusion)
+        at = paired.clamp(min=0, max=count - 1)
+        iou = overlap.gather(1, at[:, None])[:, 0].to(iou)
+        center = (boxes.center - truth.center[at]).norm(dim=1)
+        turn = (boxes.yaw - truth.yaw[at]).remainder(math.pi)
+        yaw = torch.minimum(turn, math.pi - turn)
+    columns = (boxes.label, boxes.score, verdict, distance, occlusion, matched, iou, center, yaw)
+    return torch.stack([column.float() for column in columns], 1)
+
+
+def _range(boxes: Boxes) -> Tensor:
+    distance: Tensor = boxes.center[:, :2].norm(dim=1)
+    return distance
+
+
+def _occlusion(truth: Boxes) -> Tensor:
+    """As labelled, -1 where it is not."""
+    return torch.full_like(truth.score, -1) if truth.occlusion is None else truth.occlusion.to(truth.score)
+
+
+def _quality(rows: Tensor, objects: int) -> dict[str, float]:
+    pairs = rows[rows[:, MATCHED] == 1]
+    mean = pairs.mean(0) if len(pairs) else pairs.new_full((9,), math.nan)
+    values = (float(mean[IOU]), float(mean[CENTER]), float(mean[YAW]), len(pairs) / objects)
+    return dict(zip(QUALITIES, values, strict=True))
+
+
+def _by_bin(rows: Tensor, objects: Tensor) -> dict[str, float]:
+    """Average precision, mean IoU and number of objects of every bin that has objects."""
+    found = dict[str, float]()
+    for name, (low, high) in BINS.items():
+        here = (rows[:, RANGE] >= low) & (rows[:, RANGE] < high)
+        found |= _in_bin(name, rows[here], int(((objects[:, 1] >= low) & (objects[:, 1] < high)).sum()))
+    for name, value in VISIBILITY.items():
+        here = (rows[:, OCCLUSION] == value) | (rows[:, VERDICT] == FALSE)
+        found |= _in_bin(name, rows[here], int((objects[:, 2] == value).sum()))
+    return found
+
+
+def _in_bin(name: str, rows: Tensor, objects: int) -> dict[str, float]:
+    if objects == 0:
+        return {}
+    precision = average_precision(rows[:, SCORE], rows[:, VERDICT], objects)
+    pairs = rows[rows[:, MATCHED] == 1]
+    found = {f"ap_{name}": precision, f"objects_{name}": float(objects)}
+    return found | ({f"iou_{name}": float(pairs[:, IOU].mean())} if len(pairs) else {})
