@@ -185,7 +185,7 @@ class Loop:
         for sequence, scan, sure, unsure in pseudo:
             _link(scan, root / sequence / "points" / scan.name)
             for kind, boxes in (("boxes", sure), ("ignored", unsure)):
-                write_text(root / sequence / kind / f"{scan.stem}.txt", _lines(boxes, self.classes))
+                write_text(root / sequence / kind / f"{scan.stem}.txt", box_lines(boxes, self.classes))
             kept.update(self.classes[label] for label in sure.label.tolist())
             frames, ignored = frames + 1, ignored + len(unsure)
         write_text(root / "train.txt", "\n".join(sorted(p.name for p in root.iterdir() if p.is_dir())) + "\n")
@@ -280,7 +280,7 @@ def _link(source: Path, target: Path) -> None:
     target.symlink_to(source.resolve())
 
 
-def _lines(boxes: Boxes, classes: Sequence[str]) -> str:
+def box_lines(boxes: Boxes, classes: Sequence[str]) -> str:
     """Boxes as the folder layout has them: class x y z l w h yaw."""
     rows = zip(boxes.label.tolist(), boxes.tensor.tolist(), strict=True)
     return "".join(f"{classes[label]} {' '.join(f'{value:.4f}' for value in row)}\n" for label, row in rows)

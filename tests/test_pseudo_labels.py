@@ -40,7 +40,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert boxes is not None
             np.save(root / name / "points" / f"{place}.npy", torch.cat([points.xyz, points.features], 1).numpy())
             if place < labelled:
-                (root / name / "boxes" / f"{place}.txt").write_text(pseudo_labels._lines(boxes, CLASSES))
+                (root / name / "boxes" / f"{place}.txt").write_text(pseudo_labels.box_lines(boxes, CLASSES))
     (root / "train.txt").write_text("street\nroad\n")
     (root / "val.txt").write_text("held_out\n")
     return root

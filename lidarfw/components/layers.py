@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarfw.errors import ConfigError, GeometryError
+from lidarfw.ops import SparseConv3d, SparseSequential, SubmanifoldConv3d
 from lidarfw.types import Grid
 
 
@@ -54,6 +55,37 @@ def conv_block(in_channels: int, channels: int, stride: int = 1) -> nn.Sequentia
     """3 x 3 convolution, batch normalisation, ReLU; a map of H x W becomes ceil(H / stride) x ceil(W / stride)."""
     conv = nn.Conv2d(in_channels, channels, 3, stride, padding=1, bias=False)
     return nn.Sequential(conv, BatchNorm2d(channels), nn.ReLU(inplace=True))
+
+
+def submanifold_block(in_channels: int, channels: int) -> SparseSequential:
+    """3 x 3 x 3 submanifold convolution of Voxels, batch normalisation, ReLU: the same cells."""
+    conv = SubmanifoldConv3d(in_channels, channels, 3)
+    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
+
+
+def halving_block(in_channels: int, channels: int) -> SparseSequential:
+    """3 x 3 x 3 sparse convolution of stride 2, batch normalisation, ReLU; n cells along an axis become ceil(n / 2)."""
+    conv = SparseConv3d(in_channels, channels, (3, 3, 3), (2, 2, 2), (1, 1, 1))
+    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
+
+
+def folding_block(in_channels: int, channels: int) -> SparseSequential:
+    """3 x 1 x 1 sparse convolution of stride 2 along z, batch normalisation, ReLU; see `folded_depth`."""
+    conv = SparseConv3d(in_channels, channels, (3, 1, 1), (2, 1, 1), (0, 0, 0))
+    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
+
+
+def folded_depth(grid: Grid, backbone: str) -> int:
+    """Cells along z of the level of stride 8 after `folding_block`. Raises ConfigError where none is left."""
+    depth = (grid.shape(8)[0] - 3) // 2 + 1
+    if depth < 1:
+        height = grid.upper[2] - grid.lower[2]
+        raise ConfigError(
+            f"backbone '{backbone}' needs at least 17 cells along z, its grid has {grid.shape()[0]}\n"
+            f"  given: z from {grid.lower[2]} to {grid.upper[2]} m in cells of {grid.cell[2]} m\n"
+            f"  fix: cells of at most {height / 17:.3f} m along z, or a higher range"
+        )
+    return depth
 
 
 def grid_from_options(lower: Sequence[float], upper: Sequence[float], cell: Sequence[float]) -> Grid:

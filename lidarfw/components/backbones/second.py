@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from torch import nn
 
-from lidarfw.components.layers import BatchNorm1d, grid_from_options
+from lidarfw.components.layers import (
+    folded_depth,
+    folding_block,
+    grid_from_options,
+    halving_block,
+    submanifold_block,
+)
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Backbone
-from lidarfw.ops import SparseConv3d, SparseSequential, SubmanifoldConv3d, voxelize_mean
+from lidarfw.ops import SparseSequential, voxelize_mean
 from lidarfw.types import Points, Spec, Voxels
-
-Triple = tuple[int, int, int]
 
 
 class SecondBackbone(Backbone):
@@ -42,15 +46,14 @@ class SecondBackbone(Backbone):
         submanifold convolutions in each stage."""
         super().__init__()
         self.grid = grid_from_options(lower, upper, cell)
-        depths = [self.grid.shape(stride)[0] for stride in (1, 2, 4, 8)]
-        depths[3] = (depths[3] - 3) // 2 + 1
-        self._check(channels, layers, depths[3])
-        first = [_submanifold(3 + points.channels, channels[0]), *_submanifolds(channels[0], layers - 1)]
+        _check(channels, layers)
+        depths = [*(self.grid.shape(stride)[0] for stride in (1, 2, 4)), folded_depth(self.grid, "second")]
+        first = [submanifold_block(3 + points.channels, channels[0]), *_submanifolds(channels[0], layers - 1)]
         stages = [SparseSequential(*first)]
         for i in range(1, 4):
-            down = _strided(channels[i - 1], channels[i], (3, 3, 3), (2, 2, 2), (1, 1, 1))
+            down = halving_block(channels[i - 1], channels[i])
             stages.append(SparseSequential(down, *_submanifolds(channels[i], layers)))
-        stages[3].append(_strided(channels[3], out_channels, (3, 1, 1), (2, 1, 1), (0, 0, 0)))
+        stages[3].append(folding_block(channels[3], out_channels))
         self.stages = nn.ModuleList(stages)
         widths = [*channels[:3], out_channels]
         self.provides = [Spec(Voxels, widths[i], 2**i, self.grid, depth=depths[i]) for i in range(4)]
@@ -63,31 +66,15 @@ class SecondBackbone(Backbone):
             levels.append(voxels)
         return levels
 
-    def _check(self, channels: tuple[int, ...], layers: int, depth: int) -> None:
-        if len(channels) != 4 or min(*channels, layers) < 1:
-            raise ConfigError(
-                "backbone 'second' has four stages and needs a positive width for each, and at least one layer\n"
-                f"  given: channels: {list(channels)}, layers: {layers}\n"
-                "  fix: for example channels: [16, 32, 64, 64], layers: 2"
-            )
-        if depth < 1:
-            height = self.grid.upper[2] - self.grid.lower[2]
-            raise ConfigError(
-                f"backbone 'second' needs at least 17 cells along z, its grid has {self.grid.shape()[0]}\n"
-                f"  given: z from {self.grid.lower[2]} to {self.grid.upper[2]} m in cells of {self.grid.cell[2]} m\n"
-                f"  fix: cells of at most {height / 17:.3f} m along z, or a higher range"
-            )
 
-
-def _submanifold(in_channels: int, channels: int) -> SparseSequential:
-    conv = SubmanifoldConv3d(in_channels, channels, 3)
-    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
+def _check(channels: tuple[int, ...], layers: int) -> None:
+    if len(channels) != 4 or min(*channels, layers) < 1:
+        raise ConfigError(
+            "backbone 'second' has four stages and needs a positive width for each, and at least one layer\n"
+            f"  given: channels: {list(channels)}, layers: {layers}\n"
+            "  fix: for example channels: [16, 32, 64, 64], layers: 2"
+        )
 
 
 def _submanifolds(channels: int, number: int) -> list[SparseSequential]:
-    return [_submanifold(channels, channels) for _ in range(number)]
-
-
-def _strided(in_channels: int, channels: int, kernel: Triple, stride: Triple, padding: Triple) -> SparseSequential:
-    conv = SparseConv3d(in_channels, channels, kernel, stride, padding)
-    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
+    return [submanifold_block(channels, channels) for _ in range(number)]

@@ -10,25 +10,22 @@ from __future__ import annotations
 from typing import ClassVar
 
 import torch
-from lidarfw.components.layers import BatchNorm1d, grid_from_options
+from lidarfw.components.layers import (
+    BatchNorm1d,
+    folded_depth,
+    folding_block,
+    grid_from_options,
+    halving_block,
+    submanifold_block,
+)
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Backbone
-from lidarfw.ops import (
-    SparseConv3d,
-    SparseModule,
-    SparseSequential,
-    SubmanifoldConv3d,
-    scatter_mean,
-    to_dense,
-    voxelize_mean,
-)
+from lidarfw.ops import SparseModule, SparseSequential, SubmanifoldConv3d, scatter_mean, to_dense, voxelize_mean
 from lidarfw.types import BEV, Points, Spec, Voxels
 from torch import nn
 
-Triple = tuple[int, int, int]
 PLACES = ("none", "input", "all", "conv")  # of squeeze and excitation
 REDUCTION, NARROWEST = 16, 8  # the hidden layer has channels / 16 units, at least 8
-FOLD = ((3, 1, 1), (2, 1, 1), (0, 0, 0))  # kernel, stride, padding of the convolution that folds the z axis
 
 
 class SqueezeExcitation(SparseModule):
@@ -55,7 +52,7 @@ class ResidualBlock(SparseModule):
         super().__init__()
         second: list[nn.Module] = [SubmanifoldConv3d(channels, channels, 3), BatchNorm1d(channels)]
         second += [SqueezeExcitation(channels)] if excite else []
-        self.branch = SparseSequential(_submanifold(channels, channels), *second)
+        self.branch = SparseSequential(submanifold_block(channels, channels), *second)
 
     def forward(self, voxels: Voxels) -> Voxels:
         return voxels.with_features(torch.relu(self.branch(voxels).features + voxels.features))
@@ -90,18 +87,19 @@ class ResNetSE(Backbone):
         the map's convolution, residual blocks of each stage, place of squeeze and excitation."""
         super().__init__()
         self.grid = grid_from_options(lower, upper, cell)
-        depth = (self.grid.shape(8)[0] - 3) // 2 + 1
-        self._check(se, depth)
+        depth = folded_depth(self.grid, "resnet_se")
+        if se not in PLACES:
+            raise ConfigError(f"backbone 'resnet_se': se is one of {', '.join(PLACES)}, not {se!r}")
         excited = se == "all"
         self.stem = SparseSequential(
-            _submanifold(3 + points.channels, channels[0]), *_excitation(channels[0], excited or se == "input")
+            submanifold_block(3 + points.channels, channels[0]), *_excitation(channels[0], excited or se == "input")
         )
         self.stages = nn.ModuleList()
         for number, width in enumerate(channels):
-            down = [] if number == 0 else [_strided(channels[number - 1], width, (3, 3, 3), (2, 2, 2), (1, 1, 1))]
+            down = [] if number == 0 else [halving_block(channels[number - 1], width)]
             residual = [ResidualBlock(width, se == "conv") for _ in range(blocks)]
             self.stages.append(SparseSequential(*down, *residual, *_excitation(width, excited)))
-        self.fold = _strided(channels[3], out_channels, *FOLD)
+        self.fold = folding_block(channels[3], out_channels)
         depths = [self.grid.shape(2**number)[0] for number in range(4)]
         levels = [Spec(Voxels, c, 2**i, self.grid, depth=depths[i]) for i, c in enumerate(channels)]
         self.provides = (levels, Spec(BEV, out_channels * depth, 8, self.grid))
@@ -113,27 +111,6 @@ class ResNetSE(Backbone):
             voxels = stage(voxels)
             levels.append(voxels)
         return levels, BEV(to_dense(self.fold(voxels)).flatten(1, 2), self.grid, 8)
-
-    def _check(self, se: str, depth: int) -> None:
-        if se not in PLACES:
-            raise ConfigError(f"backbone 'resnet_se': se is one of {', '.join(PLACES)}, not {se!r}")
-        if depth < 1:
-            height = self.grid.upper[2] - self.grid.lower[2]
-            raise ConfigError(
-                f"backbone 'resnet_se' needs at least 17 cells along z, its grid has {self.grid.shape()[0]}\n"
-                f"  given: z from {self.grid.lower[2]} to {self.grid.upper[2]} m in cells of {self.grid.cell[2]} m\n"
-                f"  fix: cells of at most {height / 17:.3f} m along z, or a higher range"
-            )
-
-
-def _submanifold(in_channels: int, channels: int) -> SparseSequential:
-    conv = SubmanifoldConv3d(in_channels, channels, 3)
-    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
-
-
-def _strided(in_channels: int, channels: int, kernel: Triple, stride: Triple, padding: Triple) -> SparseSequential:
-    conv = SparseConv3d(in_channels, channels, kernel, stride, padding)
-    return SparseSequential(conv, BatchNorm1d(channels), nn.ReLU(inplace=True))
 
 
 def _excitation(channels: int, wanted: bool) -> list[nn.Module]:
