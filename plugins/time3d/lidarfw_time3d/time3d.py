@@ -150,7 +150,8 @@ class Time3D(Tracker):
         super().__init__()
         words = (
             ("affinity", affinity, AFFINITIES), ("similarity", similarity, SIMILARITIES),
-            ("geometry", geometry, GEOMETRIES), ("spatial_flow", spatial_flow, FLOWS), ("temporal_flow", temporal_flow, FLOWS),
+            ("geometry", geometry, GEOMETRIES),
+            ("spatial_flow", spatial_flow, FLOWS), ("temporal_flow", temporal_flow, FLOWS),
             *(("cues", cue, CUES) for cue in cues),
         )  # fmt: skip
         for name, value, known in words:

@@ -336,7 +336,9 @@ def test_every_cue_and_flow_can_be_left_out(options: dict[str, Any]) -> None:
     frames = [found.replace(embedding=torch.randn(2, 8), box2d=torch.rand(2, 4) * 100)
               for found in (boxes([(10, 0), (20, 5)]), boxes([(11, 0), (40, -5)]))]  # fmt: skip
     for sequence in (frames, [boxes([(10, 0), (20, 5)]), boxes([(11, 0), (40, -5)])]):
-        output = tracker.train()(Boxes.cat(sequence, as_batch=True), [FrameMeta(str(t), "s", t, t / 10) for t in (0, 1)])
+        output = tracker.train()(
+            Boxes.cat(sequence, as_batch=True), [FrameMeta(str(t), "s", t, t / 10) for t in (0, 1)]
+        )
         assert output.logits.isfinite().all()
         assert [len(tracks.id) for tracks in follow(tracker.eval(), sequence)] == [2, 2]
 
