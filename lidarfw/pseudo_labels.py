@@ -227,8 +227,8 @@ class Loop:
 
 def _folder_node(cfg: DictConfig) -> tuple[str, dict[str, Any]]:
     """Name and options of the dataset; ConfigError where pseudo-labels of it cannot be written."""
-    nodes = config.to_plain(cfg)["dataset"] or {}
-    name, node = next(iter(nodes.items()), ("", {}))
+    nodes: dict[str, dict[str, Any]] = config.to_plain(cfg)["dataset"] or {}
+    name, node = next(iter(nodes.items()), ("", dict[str, Any]()))
     if len(nodes) != 1 or node.get("type", name) != "folder" or not node.get("boxes"):
         raise ConfigError(
             f"pseudo-labels are made for a folder of scans some of which have boxes, the dataset is {name or 'none'}\n"

@@ -14,6 +14,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def by_stages(model: PerceptionModel, head: MSRMHead, batch: Batch, rounds: int)
         model.predict(batch)
 
     try:
-        return in_turn({str(n): lambda n=n: run(n) for n in range(1, len(head.encoders) + 1)}, rounds)
+        return in_turn({str(n): partial(run, n) for n in range(1, len(head.encoders) + 1)}, rounds)
     finally:
         for name, modules in whole.items():
             setattr(head, name, modules)
@@ -74,7 +75,7 @@ def by_regions(model: PerceptionModel, head: MSRMHead, batch: Batch, rounds: int
         model.predict(batch)
 
     try:
-        times = in_turn({str(n): lambda n=n: run(n) for n in REGIONS}, rounds)
+        times = in_turn({str(n): partial(run, n) for n in REGIONS}, rounds)
         found = {}
         for name, value in times.items():
             head.regions = int(name)
