@@ -27,7 +27,7 @@ from lidarfw_time3d.kalman import Array, Int, Motion, Noise
 NOISE = Noise(measured=0.1, place=0.02, shape=0.01, velocity=0.2, first=0.1, first_velocity=100.0)
 _RIVAL = FEATURES.index("rival_same")
 _HOPELESS = 0.015  # chance at which an unseen track ends
-_REST = 0.7  # m/s below which an unseen object is taken to stand still
+REST = 0.7  # m/s below which an unseen object is taken to stand still
 _NEWBORN = 1.5  # times the gate for a track whose velocity is not known yet
 _GROWTH = 0.12  # of the gate per unseen frame
 
@@ -138,7 +138,7 @@ class KalmanConfidence(Tracker):
         New tracks start with the `velocity` (N, 3) that the detector gives, else at rest.
         """
         state.frames += 1
-        slow = (state.evidence.missed > 0) & (np.hypot(*state.motion.velocity[:, :2].T) < _REST)
+        slow = (state.evidence.missed > 0) & (np.hypot(*state.motion.velocity[:, :2].T) < REST)
         state.motion.velocity[slow] = 0
         state.motion.predict(passed, passed / self.frame_time, NOISE)
         state.evidence.wait()

@@ -15,12 +15,14 @@ from lidarfw.interfaces import Tracker
 from lidarfw.plain import from_plain, to_plain
 from lidarfw.types import Boxes, FrameMeta, FrameResult, Poses, Spec, Tracks
 
+from lidarfw_time3d import kalman_confidence
 from lidarfw_time3d.ab3dmot import AB3DMOT
 from lidarfw_time3d.assignment import gated_hungarian, greedy, hungarian
 from lidarfw_time3d.bench import measure
 from lidarfw_time3d.confidence import FEATURES, Confidence, log_odds
 from lidarfw_time3d.kalman import Motion, Noise
 from lidarfw_time3d.kalman_confidence import KalmanConfidence, KalmanConfidenceState
+from lidarfw_time3d.kalman_offline import KalmanOffline, Moment, smooth
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 SPEC = Spec(Boxes, classes=CLASSES)
@@ -308,3 +310,62 @@ def test_the_bench_measures_every_tracker() -> None:
         assert len(spent) == 6
         assert len(held) == 12
         assert min(spent) > 0
+
+
+def test_the_smoother_is_the_best_line_through_all_that_was_seen() -> None:
+    """The backward pass gives the least-squares solution of the whole sequence, computed with matrices."""
+    rng, count, noise = np.random.default_rng(0), 12, kalman_confidence.NOISE
+    seen = 0.1 * np.arange(count) * 8 + rng.normal(0, 0.3, count)
+    motion, moments = Motion.start(np.zeros((1, 7)), noise), []
+    motion.box[0, 0] = seen[0]
+    for t in range(count):
+        if t:
+            motion.predict(0.1, 1.0, noise)
+            motion.update(np.array([0]), np.array([[seen[t], 0, 0, 0, 0, 0, 0]]), noise)
+        kept = Motion(*(values.copy() for values in vars(motion).values()))
+        moments.append(Moment(np.array([1]), kept, np.zeros(1), np.eye(4), 0.1))
+    found = smooth(moments, 0.1)
+    # unknowns x_0, v_0, x_1, v_1, ...; each row weighted by the inverse of its standard deviation
+    rows, right = [], []
+
+    def add(values: dict[int, float], goal: float, variance: float) -> None:
+        row = np.zeros(2 * count)
+        for place, value in values.items():
+            row[place] = value
+        rows.append(row / math.sqrt(variance))
+        right.append(goal / math.sqrt(variance))
+
+    add({0: 1}, seen[0], float(noise.first))
+    add({1: 1}, 0, float(noise.first_velocity))
+    for t in range(1, count):
+        add({2 * t: 1, 2 * t - 2: -1, 2 * t - 1: -0.1}, 0, float(noise.place))
+        add({2 * t + 1: 1, 2 * t - 1: -1}, 0, float(noise.velocity))
+        add({2 * t: 1}, seen[t], float(noise.measured))
+    best = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+    np.testing.assert_allclose([m.box[0, 0] for m in found], best[::2], atol=1e-8)
+    np.testing.assert_allclose([m.velocity[0, 0] for m in found], best[1::2], atol=1e-7)
+
+
+def test_offline_tracks_are_the_same_but_smoother_and_go_through_gaps() -> None:
+    rng = np.random.default_rng(0)
+    true = [10 + 0.8 * t + 0.02 * t * t for t in range(30)]
+    sequence = [boxes([(x + rng.normal(0, 0.3), 0, 0)] if t not in (14, 15, 16) else []) for t, x in enumerate(true)]
+    drive = [np.eye(4) for _ in sequence]
+    for t, pose in enumerate(drive):
+        pose[0, 3] = 0.3 * t
+    online, tracker = follow(KalmanConfidence(SPEC), sequence, drive), KalmanOffline(SPEC)
+    state = tracker.start()
+    frames = [FrameResult(FrameMeta(str(t), "s", t, t / 10)) for t in range(30)]
+    for frame, found, pose in zip(frames, sequence, drive, strict=True):
+        assert tracker.step(state, frame, found, pose=known(pose)) == []
+    offline = [result.tracks for result in tracker.flush(state)]
+    assert [tracks.id.tolist() for tracks in online] == [tracks.id.tolist() for tracks in offline]
+    error = {}
+    for name, out in (("online", online), ("offline", offline)):
+        error[name] = np.array(
+            [float(tracks.boxes.center[0, 0]) - true[t] for t, tracks in enumerate(out) if len(tracks.id)]
+        )
+        assert all(torch.equal(a.boxes.score, b.boxes.score) for a, b in zip(online, out, strict=True))
+    assert np.abs(error["offline"]).mean() < 0.8 * np.abs(error["online"]).mean()
+    assert np.abs(np.diff(error["offline"], 2)).mean() < 0.5 * np.abs(np.diff(error["online"], 2)).mean()
+    assert tracker.flush(tracker.start()) == []
