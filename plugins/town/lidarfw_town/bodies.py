@@ -24,7 +24,8 @@ _CLOTHES = (
     (0.3, 0.4, 0.25),
     (0.85, 0.5, 0.1),
 )
-PANE = Surface(10, 0.03, (0.07, 0.09, 0.11))
+PANE = Surface(10, 0.03, (0.07, 0.09, 0.11))  # beams pass it
+_DIRTY = 0.06  # reflectance of the panes that send beams back
 TYRE = Surface(10, 0.08, (0.05, 0.05, 0.05))
 PLATE = Surface(10, 1.7, (0.85, 0.85, 0.75))
 HEADLAMP = Surface(10, 0.7, (0.9, 0.9, 0.85), 6.0)
@@ -110,8 +111,16 @@ _BUS = Outline(
     0.1, (True, True, True, True, True), (0.25, 0.79), 0.48)  # fmt: skip
 
 
-def _body(outline: Outline, length: float, width: float, height: float, paint: Surface) -> Mesh:
+def _panes(glass: list[tuple[Array, ...]], rng: np.random.Generator) -> Mesh:
+    """The windows of a vehicle: beams pass some, and others send them back."""
+    mesh = quads(glass, PANE)
+    through = np.repeat(rng.random(len(glass)) < 0.55, 2)
+    return replace(mesh, reflectance=np.where(through, mesh.reflectance, _DIRTY).astype(np.float32))
+
+
+def _body(outline: Outline, size: Sequence[float], paint: Surface, rng: np.random.Generator) -> Mesh:
     """The hull of an outline with glass, wheels, lamps, plates and mirrors, at its size in metres."""
+    length, width, height = size
     sections = np.array([_section(*station, outline.low) for station in outline.stations])
     sections *= (length, width / 2, height)
     sections[..., 0] -= length / 2
@@ -124,7 +133,7 @@ def _body(outline: Outline, length: float, width: float, height: float, paint: S
             steep = side == 2 and abs(a[2, 2] - b[2, 2]) > 0.12 * height
             (glass if glazed and (side in (1, 3) or steep) else hull).append(face)
     ends = [(s[0], s[k], s[k + 1]) for s in (sections[0], sections[-1]) for k in range(1, 5)]
-    parts = [quads(hull, paint), quads(glass, PANE), of(ends, paint)]
+    parts = [quads(hull, paint), _panes(glass, rng), of(ends, paint)]
     parts += _wheels(outline.wheels, outline.wheel, length, width)
     low, nose = outline.low * height, 0.45 * height
     parts += [
@@ -171,7 +180,7 @@ def _paint(rng: np.random.Generator) -> Surface:
     """Paint whose reflectance in the infrared says little about its colour."""
     colour = _PAINTS[int(rng.integers(len(_PAINTS)))]
     # about half of the beams on real paint come back too faint for a remission
-    reflectance = float(rng.choice([0.06, 0.09, 0.12, 0.18, 0.28, 0.4])) * float(rng.uniform(0.8, 1.2))
+    reflectance = float(rng.choice([0.05, 0.08, 0.12, 0.28, 0.36, 0.45])) * float(rng.uniform(0.8, 1.2))
     return Surface(10, max(reflectance, 0.05), colour).varied(rng, 0.08)
 
 
@@ -190,14 +199,14 @@ def car(rng: np.random.Generator) -> Mesh:
     )
     outline, mean = choices[int(rng.choice(4, p=[0.25, 0.42, 0.18, 0.15]))]
     size = _size(rng, mean)
-    return _body(outline.varied(rng), *size, _paint(rng)).fitted(*size)
+    return _body(outline.varied(rng), size, _paint(rng), rng).fitted(*size)
 
 
 def van(rng: np.random.Generator) -> Mesh:
     """A panel van or a people carrier."""
     outline, mean = ((_PANEL_VAN, (5.3, 1.95, 2.35)), (_MINIVAN, (4.7, 1.83, 1.9)))[int(rng.integers(2))]
     size = _size(rng, mean)
-    return _body(outline, *size, _paint(rng)).fitted(*size)
+    return _body(outline, size, _paint(rng), rng).fitted(*size)
 
 
 def truck(rng: np.random.Generator) -> Mesh:
@@ -229,7 +238,7 @@ def truck(rng: np.random.Generator) -> Mesh:
 def bus(rng: np.random.Generator) -> Mesh:
     """A city bus."""
     size = _size(rng, (11.5, 2.55, 3.1), 0.05)
-    return _body(_BUS, *size, _paint(rng)).fitted(*size)
+    return _body(_BUS, size, _paint(rng), rng).fitted(*size)
 
 
 def _person(rng: np.random.Generator, swing: float, hip: float, lean: float = 0.0, *, seated: bool = False) -> Mesh:

@@ -53,7 +53,16 @@ def _facade(a: Array, b: Array, height: float, storeys: int, wall: Surface, rng:
     reveals = [
         np.stack([outer[:, i], outer[:, j], inner[:, j], inner[:, i]], 1) for i, j in ((0, 1), (1, 2), (2, 3), (3, 0))
     ]
-    return join([quads(front[~window], wall), quads(np.concatenate(reveals), wall), quads(inner, GLASS)])
+    return join([quads(front[~window], wall), quads(np.concatenate(reveals), wall), _windows(inner, rng)])
+
+
+def _windows(corners: Array, rng: np.random.Generator) -> Mesh:
+    """Panes; behind most of them something stands or hangs that beams come back from."""
+    mesh = quads(corners, GLASS)
+    behind = np.repeat(
+        np.where(rng.random(len(corners)) < 0.85, rng.uniform(0.2, 0.5, len(corners)), GLASS.reflectance), 2
+    )
+    return replace(mesh, reflectance=behind.astype(np.float32))
 
 
 def _edges(length: float, count: int, share: float) -> Array:

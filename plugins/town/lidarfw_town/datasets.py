@@ -67,12 +67,12 @@ class TownDataset(Dataset):
 
         return Job(root=str(self._folder), split=self._make, frames=self._frames[self._make], **self._settings)  # type: ignore[arg-type]
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Make the files of the split, unless they stand."""
         from lidarfw_town.generate import generate
 
-        generate(self.job, self._workers or os.cpu_count() or 1)
-        super().prepare()
+        generate(self.job, workers or self._workers or os.cpu_count() or 1)
+        super().prepare(workers)
 
 
 class TownDrives(TownDataset, DriveDataset):

@@ -15,6 +15,7 @@ from lidarfw_town.sensors import Floats, Hits, Lidar, Scene, first_hits, receive
 from lidarfw_town.traffic import Mover, Parked, Traffic
 from lidarfw_town.world import World
 
+NEAREST = 0.5  # metres: what is nearer is left out
 SEEN_FROM = 120.0  # metres: objects farther away are not simulated
 _MOVES = 0.3  # m/s from which on an object counts as moving
 
@@ -30,6 +31,7 @@ class Object:
     moving: bool
     points: int  # of the scan that lie on it
     visible: float  # share of the beams towards it that reach it, 0..1
+    moment: float  # when the beams pass it, in periods of the drive: then it is in its box
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,11 @@ class TownFrame:
     pose: Array
     bodies: list[Body]
     grid: Floats  # (beams, columns) ranges in metres, 0 where nothing came back
+
+    @property
+    def columns(self) -> np.ndarray:
+        """The column (N,) of the turn in which every point was measured."""
+        return np.asarray(np.nonzero(self.grid > NEAREST)[1])
 
     @cached_property
     def movers(self) -> Scene:
@@ -120,7 +127,7 @@ class Drive:
         bodies = self._bodies(step, pose)
         hits, beams = self._hits(bodies, origins, directions)
         scan = receive(self.lidar, hits, directions, rng, WEATHER[self.weather])
-        back = np.flatnonzero(scan.range.ravel() > 0.5)
+        back = np.flatnonzero(scan.range.ravel() > NEAREST)
         local = self._directions.reshape(-1, 3)[back] * scan.range.ravel()[back, None]
         if self.compensated:
             world = origins[back] + directions[back] * scan.range.ravel()[back, None]
@@ -131,6 +138,19 @@ class Drive:
         label = _labels(scan.semantic.ravel()[back], instance, objects)
         moving = [body for thing, body, _, _ in bodies if isinstance(thing, Mover)]
         return TownFrame(step, step * self.lidar.turn, points, label, objects, pose, moving, scan.range)
+
+    def in_world(self, frame: TownFrame) -> Array:
+        """Where the points of a frame were in the world (N, 3), each by the LiDAR's pose when it was measured."""
+        moments = frame.number + self._shares.astype(float)[frame.columns]
+        poses = frame.pose[None] if self.compensated else self.poses(moments)
+        return np.asarray((poses[:, :3, :3] @ frame.points[:, :3, None].astype(float))[..., 0] + poses[:, :3, 3])
+
+    def in_box(self, thing: Object, frame: TownFrame, world: Array) -> Array:
+        """Places (N, 3) of the world in the axes of an object's box, from its centre, when the beams pass it."""
+        pose = frame.pose if self.compensated else self.poses(np.array([thing.moment]))[0]
+        cosine, sine = np.cos(thing.box[6]), np.sin(thing.box[6])
+        turn = np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
+        return np.asarray(((world - pose[:3, 3]) @ pose[:3, :3] - thing.box[:3]) @ turn)
 
     def _rays(self, step: int) -> tuple[Floats, Floats]:
         """Origins and directions (beams * columns, 3) in the world; every column from where the vehicle then is."""
@@ -189,7 +209,7 @@ class Drive:
             box = _box_of(body.placed, axes_of, float(np.arctan2(axes[1], axes[0])))
             visible = reached[thing.id] / max(beams[thing.id], reached[thing.id])
             objects.append(
-                Object(thing.id, thing.kind, box, velocity, speed > _MOVES, points.get(thing.id, 0), visible)
+                Object(thing.id, thing.kind, box, velocity, speed > _MOVES, points.get(thing.id, 0), visible, moment)
             )
         return objects
 

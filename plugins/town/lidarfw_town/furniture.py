@@ -52,6 +52,13 @@ def tree(rng: np.random.Generator) -> Mesh:
     return join(parts)
 
 
+def copse(rng: np.random.Generator) -> Mesh:
+    """Some trees that have grown together, with leaves down to the ground; coarse, to be seen from afar."""
+    wide, height = float(rng.uniform(2.5, 4.5)), float(rng.uniform(5, 12))
+    green = FOLIAGE.varied(rng, 0.2)
+    return leaves((0, 0, height * 0.48), (wide, wide, height / 2), int(14 * wide * height), 0.8, green, rng)
+
+
 def bush(rng: np.random.Generator) -> Mesh:
     """A bush without a trunk."""
     radius, height = float(rng.uniform(0.5, 1.3)), float(rng.uniform(0.5, 1.1))

@@ -35,9 +35,9 @@ class Surface:
         return replace(self, reflectance=reflectance, colour=(red, green, blue))
 
 
-ROAD = Surface(40, 0.30, (0.30, 0.30, 0.31))
+ROAD = Surface(40, 0.28, (0.30, 0.30, 0.31))
 PARKING = Surface(44, 0.33, (0.38, 0.37, 0.36))
-PAVEMENT = Surface(48, 0.34, (0.52, 0.50, 0.47))
+PAVEMENT = Surface(48, 0.33, (0.52, 0.50, 0.47))
 KERB = Surface(48, 0.36, (0.60, 0.59, 0.57))
 BUILDING = Surface(50, 0.45, (0.70, 0.62, 0.52))
 ROOF = Surface(50, 0.30, (0.42, 0.22, 0.17))
@@ -80,7 +80,7 @@ class Mesh:
     @functools.cached_property
     def panes(self) -> npt.NDArray[np.int64]:
         """Numbers (T,) of the windows of houses, each of two triangles that follow each other; -1 for all else."""
-        glass = (self.semantic == GLASS.semantic) & (self.reflectance < 0.08)
+        glass = (self.semantic == GLASS.semantic) & is_glass(self.colour)
         at = np.arange(len(self))
         begins = glass & ~np.concatenate([[False], glass[:-1]])
         first = np.maximum.accumulate(np.where(begins, at, 0))
@@ -114,6 +114,11 @@ class Mesh:
         scale = np.array([length, width, height]) / (high - low)
         origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
         return replace(self, triangles=((self.triangles - origin) * scale).astype(np.float32))
+
+
+def is_glass(colour: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+    """Whether colours (N, 3) are those of the panes of houses, which are never varied."""
+    return np.asarray((colour == np.array(GLASS.colour, np.float32)).all(1))
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:

@@ -14,7 +14,7 @@ from scipy import ndimage
 from lidarfw_town.bodies import make
 from lidarfw_town.camera import rays_of
 from lidarfw_town.light import Lamps, Light, lamps_of, light_of
-from lidarfw_town.mesh import Array
+from lidarfw_town.mesh import Array, is_glass
 from lidarfw_town.sensors import Floats, Scene, cast, surfaces, unit
 
 if TYPE_CHECKING:
@@ -149,7 +149,8 @@ def _gloss(seen: _Seen, wet: npt.NDArray[np.bool_], light: Light) -> Array:
     cosine = np.abs((seen.along * seen.normal).sum(1, keepdims=True))
     mirror = seen.along + 2 * cosine * seen.normal
     grazing = (1 - cosine) ** 5
-    glass = (seen.reflectance < 0.08)[:, None] * np.clip(mirror[:, 2:] + 0.3, 0, 1) * (0.16 + 0.7 * grazing)
+    pane = (seen.reflectance < 0.08) | is_glass(seen.colour)
+    glass = pane[:, None] * np.clip(mirror[:, 2:] + 0.3, 0, 1) * (0.16 + 0.7 * grazing)
     film = wet * (0.04 + 0.5 * grazing)
     return np.asarray((glass + film) * np.array(light.horizon))
 

@@ -23,7 +23,8 @@ class Lidar:
     """A spinning LiDAR.
 
     Elevations from the highest beam to the lowest, degrees; columns per turn; noise of the range, metres; farthest
-    range, metres; `weakest`: signal (reflectance times cosine, relative to 30 m) at which half of the pulses are lost.
+    range, metres; `weakest`: signal (reflectance, on smooth surfaces times the cosine, relative to 30 m) at which half
+    of the pulses are lost; `mixed`: share of the points at edges that lie between two surfaces.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Lidar:
     noise: float
     farthest: float
     weakest: float
+    mixed: float = 0.08
     height: float = 1.73  # metres above the ground
     turn: float = 0.1  # seconds
 
@@ -54,14 +56,15 @@ def _even(up: float, down: float, count: int) -> tuple[float, ...]:
 
 LIDARS = {
     # its elevations are those that KITTI's scans show about their origin
-    "hdl64": Lidar("hdl64", _even(2.4, -7.8, 32) + _even(-8.4, -23.7, 32), 2048, 0.02, 80.0, 0.006),
-    "hdl32": Lidar("hdl32", _even(10.67, -30.67, 32), 2048, 0.02, 100.0, 0.008, 1.84),
-    "ouster32": Lidar("ouster32", _even(22.5, -22.5, 32), 1024, 0.015, 120.0, 0.008, 1.8),
-    "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 80.0, 0.006),
+    "hdl64": Lidar("hdl64", _even(2.4, -7.8, 32) + _even(-8.4, -23.7, 32), 2048, 0.02, 80.0, 0.03),
+    "hdl32": Lidar("hdl32", _even(10.67, -30.67, 32), 2048, 0.02, 100.0, 0.04, height=1.84),
+    "ouster32": Lidar("ouster32", _even(22.5, -22.5, 32), 1024, 0.015, 120.0, 0.04, height=1.8),
+    "small": Lidar("small", _even(2.0, -24.33, 32), 512, 0.02, 80.0, 0.03),
 }
 
 
 _ROADS = (40, 44, 60)
+_SMOOTH = (10, 13, 18)  # vehicles: paint and glass send little back at an angle
 _ROUGH = (70, 71, 72)  # vegetation, trunks, terrain: matt at every incidence, and not quite where their triangles are
 
 
@@ -157,9 +160,10 @@ class Weather:
 def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generator, weather: Weather) -> Scan:
     """What the LiDAR measures of the hits of its rays, beam by beam.
 
-    The signal falls with the square of the range and the cosine of incidence; weak pulses are lost, and the rest is
-    given with noise. At edges a beam meets two surfaces and may measure a place between them; drops of rain and fog
-    may send back more than what stands behind them. Such points have the class 1 (outlier) and belong to no object.
+    The signal falls with the square of the range, on vehicles also with the cosine of incidence; weak pulses are lost,
+    and the rest is given with noise, of three deviations at most. At edges a beam meets two surfaces and may measure a
+    place between them; drops of rain and fog may send back more than what stands behind them. Such points have the
+    class 1 (outlier) and belong to no object.
     """
     shape = (len(lidar.elevations), lidar.columns)
     rough = np.isin(hits.semantic, _ROUGH)
@@ -167,12 +171,12 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
     signal = _signal(hits, cosine, weather)
     roof = _own_roof(lidar)
     drops = np.where(roof, 0, _drops(signal, hits.distance, weather.extinction, rng))
-    lost = rng.random(len(signal), np.float32) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 2)
-    glassy = (hits.reflectance < 0.045) & (rng.random(len(signal), np.float32) < 0.55)
+    lost = rng.random(len(signal), np.float32) > 1 / (1 + (lidar.weakest / np.maximum(signal, 1e-9)) ** 4)
+    glassy = hits.reflectance < 0.045  # the beam goes on into the room or the car
     gone = lost | glassy | roof | (hits.distance > lidar.farthest)
-    noise = rng.standard_normal(len(signal), np.float32) * (lidar.noise * np.where(rough, 2.0, 1.0))
+    noise = np.clip(rng.standard_normal(len(signal), np.float32), -3, 3) * (lidar.noise * np.where(rough, 2.0, 1.0))
     distance = np.where(gone, 0, hits.distance + noise).astype(np.float32).reshape(shape)
-    mixed = _mix(distance, rng).ravel() | (drops > 0)
+    mixed = _mix(distance, lidar.mixed, rng).ravel() | (drops > 0)
     return Scan(
         np.where(drops > 0, drops, distance.ravel()).astype(np.float32).reshape(shape),
         np.where(drops > 0, 0.02, _remission(hits, cosine, rough, rng)).astype(np.float32).reshape(shape),
@@ -182,10 +186,14 @@ def receive(lidar: Lidar, hits: Hits, directions: Floats, rng: np.random.Generat
 
 
 def _signal(hits: Hits, cosine: Floats, weather: Weather) -> Floats:
-    """Strength of the pulses (N,), 1 for a white surface 30 m away. Water on roads mirrors them away."""
+    """Strength of the pulses (N,), 1 for a white surface 30 m away. Water on roads mirrors them away.
+
+    Rough ground sends light back where it came from at any incidence, as the moon does; paint and glass do not.
+    """
     reach = np.minimum(hits.distance, np.float32(1e3))
     spread = np.maximum(reach / 30, 0.15) ** 2  # devices turn down what is closer than 4.5 m
-    signal = hits.reflectance * np.maximum(cosine, 0.01) / spread * np.exp(-2 * weather.extinction * reach)
+    turned = np.where(np.isin(hits.semantic, _SMOOTH), np.maximum(cosine, 0.01), 1.0)
+    signal = hits.reflectance * turned / spread * np.exp(-2 * weather.extinction * reach)
     return np.asarray(np.where(np.isin(hits.semantic, _ROADS), 0.4, 1.0) * signal if weather.wet else signal)
 
 
@@ -212,20 +220,20 @@ def _remission(hits: Hits, cosine: Floats, rough: npt.NDArray[np.bool_], rng: np
     The device makes up for the range as far as 25 m. Smooth surfaces are weaker at grazing incidence. Dark paint and
     far roads give 0.
     """
-    grazing = np.where(rough, 1.0, cosine / (cosine + 0.03))
+    grazing = np.where(rough, 1.0, np.minimum(cosine / 0.085, 1.0))
     far = np.minimum(1.0, 25.0 / np.maximum(hits.distance, 1.0)) ** 1.2
-    value = hits.reflectance * grazing * far * (1 + np.float32(0.15) * rng.standard_normal(len(cosine), np.float32))
+    value = hits.reflectance * grazing * far * (1 + np.float32(0.18) * rng.standard_normal(len(cosine), np.float32))
     faint = value < 0.1 + np.float32(0.03) * rng.standard_normal(len(cosine), np.float32)
     faint |= (rng.random(len(cosine), np.float32) < 0.04) & ~rough  # seen at all ranges
     # levels of a hundredth, as the devices give them
     return np.where(faint, 0, np.round(np.clip(value, 0, 0.99), 2)).astype(np.float32)
 
 
-def _mix(distance: Floats, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _mix(distance: Floats, share: float, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
     """Move some points at edges to between their surface and the one behind; which ones."""
     behind = np.maximum(np.roll(distance, 1, 1), np.roll(distance, -1, 1))
     jump = behind - distance
-    mixed = (distance > 0) & (jump > 0.4) & (jump < 6) & (rng.random(distance.shape) < 0.08)
+    mixed = (distance > 0) & (jump > 0.4) & (jump < 6) & (rng.random(distance.shape) < share)
     distance[mixed] += (jump * rng.uniform(0.15, 0.85, jump.shape))[mixed]
     return np.asarray(mixed)
 
@@ -236,4 +244,4 @@ def _own_roof(lidar: Lidar) -> npt.NDArray[np.bool_]:
     directions = lidar.rays()[0].reshape(-1, 3)
     down = np.minimum(directions[:, 2], -1e-6)
     ahead, aside = -0.45 * directions[:, 0] / down, -0.45 * directions[:, 1] / down
-    return np.asarray((ahead < 1.2) & (ahead > -1.4) & (np.abs(aside) < 0.55))
+    return np.asarray((ahead < 1.1) & (ahead > -1.4) & (np.abs(aside) < 0.55))

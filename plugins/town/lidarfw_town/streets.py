@@ -10,13 +10,13 @@ import numpy as np
 
 from lidarfw_town.mesh import Array
 
-LANE = 3.5  # metres
+LANE = 3.75  # metres
 PARKING_WIDTH = 2.3
 PAVEMENT_WIDTH = 2.4
 TRIM = 11.0  # metres from a node at which its junction begins
 CROSSING = 14.0  # metres from a node at which people cross a street
 # how streets are built up, how often, and how often a side has parking bays
-_SETTINGS = {"terrace": (0.35, 0.8), "suburb": (0.4, 0.55), "open": (0.25, 0.1)}
+_SETTINGS = {"terrace": (0.15, 0.8), "suburb": (0.42, 0.6), "open": (0.43, 0.25)}
 CIRCUIT = 620.0  # metres of the way that is driven again and again
 
 

@@ -30,9 +30,9 @@ from lidarfw_town.streets import (
 from lidarfw_town.world import SLOT, World
 
 PERIOD = 0.1  # seconds from frame to frame
-_ON_ROAD = ("car",) * 20 + ("van",) * 4 + ("truck",) * 4 + ("bus",) * 2 + ("cyclist",) * 8 + ("motorcyclist",) * 2
+_ON_ROAD = ("car",) * 26 + ("van",) * 4 + ("truck",) * 2 + ("bus",) + ("cyclist",) * 8 + ("motorcyclist",) * 2
 _PARKED = ("car",) * 12 + ("van",) * 2
-_ACCELERATION, _BRAKING, _HEADWAY, _GAP = 1.4, 2.2, 1.3, 2.5  # of the driver model: m/s2, m/s2, seconds, metres
+_ACCELERATION, _BRAKING, _HEADWAY, _GAP = 1.4, 2.2, 1.8, 3.0  # of the driver model: m/s2, m/s2, seconds, metres
 _SIDEWAYS = 2.2  # m/s2 that a driver takes in curves
 _LOOK = np.arange(2, 46, 2.0)  # metres ahead on the own path at which others are looked for
 _FORESEEN = np.arange(0.5, 3.1, 0.5)  # seconds ahead that drivers look at the ways of others
@@ -116,7 +116,7 @@ class Traffic:
                 break
         return walkers, vehicles
 
-    def _drive(self, steps: int, walkers: Walkers, count: int = 24) -> list[Mover]:
+    def _drive(self, steps: int, walkers: Walkers, count: int = 20) -> list[Mover]:
         rng, network = self._rng, self._world.network
         kinds = ["car", *(str(_ON_ROAD[int(i)]) for i in rng.integers(len(_ON_ROAD), size=count))]
         paths, limits, lengths, starts = [], [], [], []

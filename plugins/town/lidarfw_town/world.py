@@ -43,8 +43,8 @@ from lidarfw_town.streets import (
 
 MARGIN = 70.0  # metres of land around the outermost streets
 SLOT = 5.6  # metres of a parking slot along the street
-_SETBACKS = {"terrace": (0.3, 0.3, 3.0, 6.0), "suburb": (4.0, 7.0, 10.0, 14.0)}  # metres from pavement to house
-_GAPS = {"terrace": (0.0, 0.0, 2.5, 5.0), "suburb": (3.5, 5.0, 9.0, 16.0)}  # metres from house to house
+_SETBACKS = {"terrace": (0.3, 3.0, 5.0, 8.0), "suburb": (6.0, 9.0, 12.0, 16.0)}  # metres from pavement to house
+_GAPS = {"terrace": (0.0, 0.0, 3.5, 6.0), "suburb": (4.0, 5.5, 11.0, 18.0)}  # metres from house to house
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +140,11 @@ class World:
             (self.aprons, PARKING, KERB_HEIGHT),
             (grass, TERRAIN, KERB_HEIGHT),
         )
-        parts = [pave(area, self.hills, kind.varied(self._rng, 0.08), self._rng, lift) for area, kind, lift in areas]
+        spread = {ROAD: 0.25}  # asphalt differs from town to town more than grass does
+        parts = [
+            pave(area, self.hills, kind.varied(self._rng, spread.get(kind, 0.08)), self._rng, lift)
+            for area, kind, lift in areas
+        ]
         return [*parts, kerbs(self.paved, self.hills, KERB)]
 
     def _markings(self) -> list[Mesh]:
@@ -214,11 +218,11 @@ class World:
         right = np.array([np.sin(yaw), -np.cos(yaw)])
         place = middle + right * (edge + setback + along / 2)
         footprint = _rectangle(place, width, along, yaw)
-        if rng.random() < 0.12 or not self._free(footprint):
+        if rng.random() < 0.3 or not self._free(footprint):
             return self._front(offset(whole, edge + 0.35), 0.8)
         self.houses.append(footprint)
         parts = [self.on_ground(house(width, along, rng), place, yaw + np.pi, 0.0)]
-        return parts + (self._front(offset(whole, edge + 0.35), 0.65) if setback > 1 else [])
+        return parts + (self._front(offset(whole, edge + 0.35), 0.9) if setback > 1 else [])
 
     def _free(self, footprint: BaseGeometry) -> bool:
         if footprint.distance(self.paved) < PAVEMENT_WIDTH + 0.2:
@@ -232,9 +236,9 @@ class World:
         if len(line) < 2 or rng.random() > chance or self._near_road(line):
             return []
         kind = rng.random()
-        if kind < 0.5:
+        if kind < 0.38:
             return [furniture.hedge(line, self.hills, height, KERB_HEIGHT, rng)]
-        if kind < 0.88:
+        if kind < 0.93:
             return [furniture.picket_fence(line, self.hills, height, FENCE.varied(rng, 0.3), KERB_HEIGHT)]
         return [furniture.wall(line, self.hills, height * 0.7, 0.25, STRUCTURE.varied(rng), KERB_HEIGHT)]
 
@@ -274,11 +278,11 @@ class World:
             return []
         if draw < 0.5:
             return [furniture.thicket(line, self.hills, KERB_HEIGHT, rng)]
-        if draw < 0.65:
+        if draw < 0.7:
             return [
                 furniture.picket_fence(line, self.hills, float(rng.uniform(0.9, 1.4)), FENCE.varied(rng), KERB_HEIGHT)
             ]
-        if draw < 0.8:
+        if draw < 0.85:
             places = resampled(line, 7.0)
             return [self.on_ground(furniture.tree(rng), place, float(rng.uniform(0, 6.28))) for place in places]
         return []
@@ -330,7 +334,7 @@ class World:
         return parts
 
     def _trees(self) -> list[Mesh]:
-        """Trees, bushes and stones in gardens, denser at the rim of the town."""
+        """Trees, bushes and stones in gardens, and woods around the town."""
         rng = self._rng
         low, high = np.array(self.land.bounds[:2]), np.array(self.land.bounds[2:])
         built = [*(house.buffer(1.5) for house in self.houses), self.aprons.buffer(1.5)]
@@ -342,12 +346,17 @@ class World:
                 continue
             kind = rng.random()
             what = (
-                furniture.tree if kind < 0.36
+                furniture.tree if kind < 0.33
+                else furniture.copse if kind < 0.36
                 else furniture.bush if kind < 0.93
                 else furniture.shed if kind < 0.97
                 else furniture.boulder
             )  # fmt: skip
             parts.append(self.on_ground(what(rng), place, float(rng.uniform(0, 6.28))))
+        rim = shapely.get_coordinates(shapely.segmentize(self.land.buffer(-12).exterior, 5.0))
+        for place in rim + rng.normal(0, 4, rim.shape):
+            if not shapely.contains_xy(taken, *place):
+                parts.append(self.on_ground(furniture.copse(rng), place, float(rng.uniform(0, 6.28))))
         return parts
 
 

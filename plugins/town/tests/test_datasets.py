@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lidarfw import cli
+from lidarfw.components.datasets.kitti import KittiDataset
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset
 
+from lidarfw_town import generate as generating
 from lidarfw_town.datasets import (
     Town360,
     TownDataset,
@@ -133,3 +136,16 @@ def test_a_truth_that_is_gone_is_told(ready: Callable[..., Any]) -> None:
             dataset[0]
     finally:
         path.write_bytes(content)
+
+
+@pytest.mark.parametrize(("workers", "expected"), [("3", 3), ("1", 1)])
+def test_prepare_takes_the_workers_of_the_command(
+    cache: str, monkeypatch: pytest.MonkeyPatch, workers: str, expected: int
+) -> None:
+    asked = []
+    monkeypatch.setattr(generating, "generate", lambda job, count: asked.append(count))
+    monkeypatch.setattr(KittiDataset, "prepare", lambda self, workers=0: None)
+    monkeypatch.setattr(KittiDataset, "__len__", lambda self: 0)
+    words = ["dataset=town_kitti", f"dataset.town_kitti.cache={cache}", "dataset.town_kitti.workers=2"]
+    assert cli.main(["prepare", *words, "--workers", workers]) == 0
+    assert set(asked) == {expected}

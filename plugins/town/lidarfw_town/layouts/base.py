@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lidarfw.errors import ConfigError
 from lidarfw.files import atomic_path
 
-from lidarfw_town.drive import Drive, TownFrame
+from lidarfw_town.drive import NEAREST, Drive, TownFrame
 from lidarfw_town.mesh import Array
 
 FEWEST = 3  # points below which an object is not labelled
@@ -112,7 +112,7 @@ def angles(pose: Array) -> list[float]:
 
 def rings(frame: TownFrame) -> np.ndarray:
     """The beam (N,) of every point, the lowest one 0."""
-    return np.asarray(len(frame.grid) - 1 - np.nonzero(frame.grid > 0.5)[0])  # a drive leaves out what is nearer
+    return np.asarray(len(frame.grid) - 1 - np.nonzero(frame.grid > NEAREST)[0])
 
 
 def box_lines(frame: TownFrame, names: Mapping[str, str]) -> str:
