@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     splits = dict.fromkeys(config.splits.values())
     datasets = {split: make_dataset(config, split) for split in splits}
     for split, dataset in datasets.items():
-        dataset.prepare()
+        dataset.prepare(args.workers)
         print(f"{split}: {len(dataset)} frames")
     for transform in make_transforms(config, training=True):
         transform.prepare(datasets[config.splits.train], args.workers)

@@ -23,8 +23,11 @@ class Dataset(ABC):
     spec: DataSpec
     split: str  # train, val, test, or what the dataset names
 
-    def prepare(self) -> None:
-        """Make the files ready; called once, on one process, before the first frame is read."""
+    def prepare(self, workers: int = 0) -> None:
+        """Make the files ready; called once, on one process, before the first frame is read.
+
+        It may start so many `workers`, with 0 as many as its own options say.
+        """
 
     @abstractmethod
     def __len__(self) -> int: ...

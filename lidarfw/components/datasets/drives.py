@@ -83,7 +83,7 @@ class DriveDataset(Dataset):
         number = int(np.searchsorted(self._starts, index, side="right")) - 1
         return self.drives[number], index - int(self._starts[number])
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """List the split, so that missing files show before training and not within."""
         len(self)
 

@@ -94,7 +94,7 @@ class KittiDataset(Dataset):
             )
         return ids
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Check that every file of the split is there, so that a gap shows before training and not within."""
         needed: dict[str, tuple[str, ...]] = {"velodyne": (".bin",), "calib": (".txt",)}
         needed |= {} if self.split == "test" else {"label_2": (".txt",)}

@@ -126,7 +126,7 @@ class Kitti360Dataset(DriveDataset):
         """Where the sensors are, and the lenses."""
         return read_calibration(self.folder / "calibration")
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Read the calibration and list the split; every picture that is an input must be there."""
         cameras = self.calibration.cameras
         for name in self.images:

@@ -123,7 +123,7 @@ class KittiTrackingDataset(DriveDataset):
         poses = self._lidar_poses(sequence, numbers) if self.poses else None
         return Drive(sequence, scans, _PERIOD * np.array(numbers), poses)
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """List the split and read its labels and calibrations."""
         for drive in self.drives:
             self._recording(drive.name)

@@ -119,7 +119,7 @@ class NuScenesDataset(DriveDataset):
         files = [root / scene.sweeps.files[key] for key in scene.keys]
         return Drive(sequence, files, scene.sweeps.times[scene.keys], scene.sweeps.poses[scene.keys])
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Check that every scan of the split is there, the past ones that it needs too."""
         for drive in self.drives:
             whole = self._whole(drive.name)

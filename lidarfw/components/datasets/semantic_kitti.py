@@ -164,7 +164,7 @@ class SemanticKittiDataset(DriveDataset):
         """Scans, times and LiDAR poses of a sequence."""
         return read_sequence(self.folder / sequence)
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Check that every scan of the split has its labels."""
         for drive in self.drives if self.labelled else []:
             there = {path.stem for path in (self.folder / drive.name / "labels").glob("*.label")}

@@ -43,9 +43,9 @@ class EitherSensor(Dataset):
             raise ConfigError(f"dataset.either_sensor.options do not fit {of!r}: {error}") from error
         self.spec: DataSpec = self.frames.spec
 
-    def prepare(self) -> None:
+    def prepare(self, workers: int = 0) -> None:
         """Let the dataset make ready."""
-        self.frames.prepare()
+        self.frames.prepare(workers)
 
     def __len__(self) -> int:
         return 2 * len(self.frames)
