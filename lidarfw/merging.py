@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Protocol, TypeVar, runtime_checkable
 
+import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -27,13 +29,15 @@ def merge(model: M) -> M:
     Every block with a method `merged` is replaced by what that gives; within each `nn.Sequential` a batch
     normalisation directly after a convolution becomes part of it, sparse convolutions included (`lidarfw.ops.fuse`).
     The copy is in eval mode and must stay in it. A checkpoint is of the model as it was trained: merge after loading.
+    Weights are multiplied out in float64 and rounded once.
     """
-    copy = fuse(model)
-    copy = copy.merged() if isinstance(copy, Mergeable) else copy
-    _replace_blocks(copy)
-    for sequence in [module for module in copy.modules() if isinstance(module, nn.Sequential)]:
+    kind = next((weight.dtype for weight in model.parameters()), torch.float32)
+    precise = fuse(deepcopy(model).double())
+    precise = precise.merged() if isinstance(precise, Mergeable) else precise
+    _replace_blocks(precise)
+    for sequence in [module for module in precise.modules() if isinstance(module, nn.Sequential)]:
         _fold_norms(sequence)
-    return copy  # type: ignore[return-value]
+    return precise.to(kind)  # type: ignore[return-value]
 
 
 def _replace_blocks(module: nn.Module) -> None:

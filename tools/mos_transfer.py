@@ -57,8 +57,8 @@ def finetune(root: str, checkpoint: Path, held_out: str, names: Sequence[str], r
         train = "+".join(name for name in names if name != held_out)
         command = [
             sys.executable, "-m", "lidarfw", "train", "experiment=mos_finetune", f"dataset.semantic_kitti.root={root}",
-            f"splits.train={train}", f"splits.val={held_out}", f"splits.test={held_out}", f"init={{from: {checkpoint}}}",
-            "trainer=cpu", "logger=csv", f"hydra.run.dir={run}", *extra,
+            f"splits.train={train}", f"splits.val={held_out}", f"splits.test={held_out}",
+            f"init={{from: {checkpoint}}}", "trainer=cpu", "logger=csv", f"hydra.run.dir={run}", *extra,
         ]  # fmt: skip
         subprocess.run(command, check=True)
     return result

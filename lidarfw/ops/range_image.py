@@ -70,7 +70,7 @@ def residual_images(
 
 
 def _closest(ranges: Tensor, wanted: Tensor, search: int) -> Tensor:
-    """(B, n, H, W) of the ranges within `search` pixels the one nearest to the wanted (B, 1, H, W); columns go round."""
+    """(B, n, H, W) of the ranges around, the one nearest to the wanted (B, 1, H, W); columns go round."""
     height, width = ranges.shape[2:]
     around = _surround(ranges, search, torch.inf)
     best, least = ranges, (ranges - wanted).abs()

@@ -27,6 +27,27 @@ FOV_POLICIES = ("clip", "drop")
 _STRIDE = 16  # of the coarsest map of the paper's network
 
 
+class DropFeatures(Transform):
+    """Points without their features (remission, intensity): for networks that meet sensors other than their own.
+
+    What a surface sends back differs from sensor to sensor and from a simulation to the world far more than where it
+    is. Stands before `range_projection`, which then makes an image of the range alone.
+    """
+
+    def __init__(self) -> None:
+        pass
+
+    def spec(self, data: DataSpec) -> DataSpec:
+        """With points that have no features. ConfigError without points."""
+        _points_spec(data, "drop_features")
+        return DataSpec({**data.inputs, "points": Spec(Points, 0)}, data.targets, data.classes, data.sweeps)
+
+    def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        """The frame with points (N, 0 features)."""
+        points: Points = frame.inputs["points"]
+        return frame.replace(inputs={**frame.inputs, "points": points.replace(features=points.features[:, :0])})
+
+
 class RangeProjection(Transform):
     """Adds the input `range`: the current scan as a range image of the range and the features of the points (eq. 1).
 
@@ -53,7 +74,7 @@ class RangeProjection(Transform):
 
     def spec(self, data: DataSpec) -> DataSpec:
         """With the range image."""
-        image = Spec(RangeImage, 1 + _points_spec(data).channels, 1, self.view)
+        image = Spec(RangeImage, 1 + _points_spec(data, "range_projection").channels, 1, self.view)
         return DataSpec({**data.inputs, IMAGE: image}, data.targets, data.classes, data.sweeps)
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
@@ -258,12 +279,12 @@ def _current(points: Points) -> Tensor:
     return torch.ones_like(points.batch, dtype=torch.bool) if points.time is None else points.time >= 0
 
 
-def _points_spec(data: DataSpec) -> Spec:
+def _points_spec(data: DataSpec, asking: str) -> Spec:
     spec = data.inputs.get("points")
     if spec is None or spec.kind is not Points:
         there = ", ".join(data.inputs) or "none"
-        raise ConfigError(f"range_projection needs the input `points`.\n  inputs of the data: {there}")
+        raise ConfigError(f"{asking} needs the input `points`.\n  inputs of the data: {there}")
     return spec
 
 
-__all__ = ["EdgeDistance", "RangeCrop", "RangeProjection", "ResidualImages"]
+__all__ = ["DropFeatures", "EdgeDistance", "RangeCrop", "RangeProjection", "ResidualImages"]

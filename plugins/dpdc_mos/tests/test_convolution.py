@@ -170,6 +170,23 @@ def test_merge_replaces_blocks_and_folds_norms() -> None:
     assert isinstance(merge(DPDC2d(3, 8)), RangeConv2d)
 
 
+def test_weights_are_merged_in_float64() -> None:
+    """A single rounding: they are those of the network in float64, and so are the results but for the arithmetic."""
+    torch.manual_seed(0)
+    net = nn.Sequential(*(nn.Sequential(DPDC2d(8, 8), BatchNorm2d(8), nn.LeakyReLU()) for _ in range(6)))
+    for _ in range(3):
+        net(30 + 20 * torch.randn(2, 8, 16, 32))
+    net.eval()
+    image = 30 + 20 * torch.randn(2, 8, 16, 32)
+    precise, merged = merge(copy.deepcopy(net).double()), merge(net)
+    for one, other in zip(merged.parameters(), precise.parameters(), strict=True):
+        assert torch.equal(one, other.float())
+    with torch.no_grad():
+        truth = copy.deepcopy(net).double()(image.double())
+        assert float((precise(image.double()) - truth).abs().max()) < 1e-11
+        assert float((merged(image) - truth).abs().max()) < 1e-5 * float(truth.abs().max())
+
+
 def test_wrong_branches() -> None:
     with pytest.raises(ConfigError, match="no branch 'cdcc'"):
         DPDC2d(1, 1, branches=["cdcc"])

@@ -14,7 +14,7 @@ from lidarfw.types import DataSpec, Frame, FrameMeta, PointLabels, Points, Range
 from torch import Tensor
 
 from lidarfw_dpdc_mos.distance import on_pixels
-from lidarfw_dpdc_mos.transforms import EdgeDistance, RangeCrop, RangeProjection, ResidualImages
+from lidarfw_dpdc_mos.transforms import DropFeatures, EdgeDistance, RangeCrop, RangeProjection, ResidualImages
 
 RNG = np.random.default_rng(0)
 
@@ -52,6 +52,16 @@ def test_the_image_holds_range_and_remission() -> None:
     assert sorted(image.features[0, 0][image.mask[0]].tolist()) == pytest.approx([9, 30])
     assert image.features[0, 1][image.mask[0]].tolist() == [0.5, 0.5]
     assert float(image.features[:, :, ~image.mask[0]].abs().max()) == 0
+
+
+def test_without_remission_the_image_holds_the_range_alone() -> None:
+    given = frame([at(10, 20), at(-50, 30)])
+    bare = DropFeatures()(given, RNG)
+    assert RangeProjection()(bare, RNG).inputs["range"].features.shape == (1, 1, 64, 2048)
+    data = DropFeatures().spec(DataSpec({"points": Spec(Points, 1)}, sweeps=2))
+    assert ResidualImages(count=1).spec(RangeProjection().spec(data)).inputs["range"].channels == 2
+    with pytest.raises(ConfigError, match="drop_features needs"):
+        DropFeatures().spec(DataSpec())
 
 
 def residuals(now: list[float], before: list[float], **options: object) -> list[float]:
@@ -196,7 +206,7 @@ def test_errors_say_what_to_do() -> None:
         RangeCrop(columns=128).spec(RangeProjection(width=64).spec(data))
     with pytest.raises(ConfigError, match="range_projection,range_crop"):
         RangeCrop().spec(data)
-    with pytest.raises(ConfigError, match="0..1, found 2"):
+    with pytest.raises(ConfigError, match="is a share"):
         RangeCrop(moving=2.0)
     with pytest.raises(ConfigError, match="search >= 0"):
         ResidualImages(search=-1)
