@@ -16,7 +16,66 @@ from lidarfw.types import Descriptors, FrameMeta, Spec, Targets
 QUERIES = 512  # at a time
 
 
-class RecallAt(Metric):
+class PlaceMetric(Metric):
+    """Base of metrics on descriptors of places: keeps those of all frames, since any may be the match of another.
+
+    Frames without a true pose are left out. Raises DataError for descriptors that are not finite.
+    """
+
+    full_state_update = False
+    vectors: list[Tensor]  # (F, D)
+    places: list[Tensor]  # (F, 6) sequence, time, x, y, z in the map, 1 for camera and 0 for others
+
+    def __init__(self, descriptors: Spec) -> None:
+        super().__init__()
+        self.channels = descriptors.channels
+        self.add_state("vectors", default=[], dist_reduce_fx="cat")
+        self.add_state("places", default=[], dist_reduce_fx="cat")
+        self._start()
+
+    def _start(self) -> None:
+        # never an empty list: processes that saw no frame must take part in the exchange of the others
+        self.vectors.append(torch.zeros(0, self.channels, device=self.device))
+        self.places.append(torch.zeros(0, 6, dtype=torch.float64, device=self.device))
+
+    def reset(self) -> None:
+        """Forget all frames."""
+        super().reset()
+        self._start()
+
+    def update(self, descriptors: Descriptors, targets: Targets, meta: list[FrameMeta]) -> None:
+        """Take the descriptors of one frame, or of a batch of frames, in."""
+        if targets.poses is None:
+            return
+        bad = [frame.id for frame, row in zip(meta, descriptors.vector, strict=True) if not row.isfinite().all()]
+        if bad:
+            raise DataError(f"frame {bad[0]}: its descriptor holds NaN or inf. Did the training diverge?")
+        said = [(sequence_number(frame.sequence), frame.time, float(frame.modality == "camera")) for frame in meta]
+        where = torch.tensor(said, dtype=torch.float64, device=self.device).view(-1, 3)
+        known = targets.poses.ok.to(self.device)
+        position = targets.poses.matrix[:, :3, 3].double().to(self.device)
+        self.vectors.append(descriptors.vector.detach().float().to(self.device)[known])
+        self.places.append(torch.cat([where[:, :2], position, where[:, 2:]], 1)[known])
+
+    def gathered(self) -> tuple[Tensor, Tensor]:
+        """Descriptors (F, D) and places (F, 6) of all frames; after an exchange the states are tensors, not lists."""
+        states = (self.vectors, self.places)
+        vectors, places = (torch.cat(state) if isinstance(state, list) else state for state in states)
+        return vectors, places
+
+
+def rank_of_first(right: Tensor, searched: Tensor, distance: Tensor) -> Tensor:
+    """(Q,) rank of the nearest right place among those searched, inf for none; of equal ones the wrong come first.
+
+    All (Q, F): which places are right, which are searched, and the distance of descriptors.
+    """
+    right = right & searched
+    nearest = distance.masked_fill(~right, torch.inf).amin(1, keepdim=True)
+    before = (searched & ~right & (distance <= nearest)).sum(1)
+    return torch.where(right.any(1), before + 1.0, torch.inf)
+
+
+class RecallAt(PlaceMetric):
     """Place recognition: Recall@N and Recall@1 %, average precision and best F1 of the best match.
 
     A match is right where the two true positions are within the radius. `radii` (metres) are judged one by one.
@@ -39,9 +98,6 @@ class RecallAt(Metric):
 
     monitor: ClassVar[str] = "recall@1"
     higher_is_better = True
-    full_state_update = False
-    vectors: list[Tensor]  # (F, D)
-    places: list[Tensor]  # (F, 5) sequence, time, x, y, z in the map
 
     def __init__(
         self,
@@ -53,46 +109,16 @@ class RecallAt(Metric):
         gap: float = 30.0,
         revisits_only: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(descriptors)
         if not radii or min(*radii, *counts, 1) <= 0:
             raise ConfigError(f"metric.recall_at: radii and counts must be above 0, got {radii} and {counts}")
-        self.channels, self.radii, self.counts = descriptors.channels, list(radii), sorted({1, *counts})
+        self.radii, self.counts = list(radii), sorted({1, *counts})
         self.map = [sequence_number(str(name)) for name in map_sequences]
         self.gap, self.revisits_only = gap, revisits_only
-        self.add_state("vectors", default=[], dist_reduce_fx="cat")
-        self.add_state("places", default=[], dist_reduce_fx="cat")
-        self._start()
-
-    def _start(self) -> None:
-        # never an empty list: processes that saw no frame must take part in the exchange of the others
-        self.vectors.append(torch.zeros(0, self.channels, device=self.device))
-        self.places.append(torch.zeros(0, 5, dtype=torch.float64, device=self.device))
-
-    def reset(self) -> None:
-        """Forget all frames."""
-        super().reset()
-        self._start()
-
-    def update(self, descriptors: Descriptors, targets: Targets, meta: list[FrameMeta]) -> None:
-        """Take the descriptors of one frame, or of a batch of frames, in."""
-        if targets.poses is None:
-            return
-        bad = [frame.id for frame, row in zip(meta, descriptors.vector, strict=True) if not row.isfinite().all()]
-        if bad:
-            raise DataError(f"frame {bad[0]}: its descriptor holds NaN or inf. Did the training diverge?")
-        where = [(sequence_number(frame.sequence), frame.time) for frame in meta]
-        known = targets.poses.ok.to(self.device)
-        position = targets.poses.matrix[:, :3, 3].double().to(self.device)
-        rows = torch.cat([torch.tensor(where, dtype=torch.float64, device=self.device).view(-1, 2), position], 1)
-        self.vectors.append(descriptors.vector.detach().float().to(self.device)[known])
-        self.places.append(rows[known])
 
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""
-        # after an exchange between processes the states are tensors instead of lists
-        vectors, places = (
-            torch.cat(state) if isinstance(state, list) else state for state in (self.vectors, self.places)
-        )
+        vectors, places = self.gathered()
         rows = torch.arange(len(places), device=places.device)
         blocks = [self._search(rows[i : i + QUERIES], vectors, places) for i in range(0, len(places), QUERIES)]
         found = torch.cat([torch.zeros(0, 2 + 2 * len(self.radii)), *(block.cpu() for block in blocks)])
@@ -108,14 +134,11 @@ class RecallAt(Metric):
         searched = self._searched(places[rows], places)
         rows, searched = rows[searched.any(1)], searched[searched.any(1)]
         distance = torch.cdist(vectors[rows].double(), vectors.double()).masked_fill(~searched, torch.inf)
-        metres = torch.cdist(places[rows, 2:], places[:, 2:], compute_mode="donot_use_mm_for_euclid_dist")
+        metres = torch.cdist(places[rows, 2:5], places[:, 2:5], compute_mode="donot_use_mm_for_euclid_dist")
         columns = [distance.amin(1), searched.sum(1)]
         for radius in self.radii:
-            right = searched & (metres <= radius)
-            nearest = distance.masked_fill(~right, torch.inf).amin(1, keepdim=True)
-            before = searched & ~right & (distance <= nearest)
-            revisit = right.any(1)
-            columns += [torch.where(revisit, before.sum(1) + 1.0, torch.inf), revisit]
+            rank = rank_of_first(metres <= radius, searched, distance)
+            columns += [rank, rank.isfinite()]
         return torch.stack([column.double() for column in columns], 1)
 
     def _searched(self, queries: Tensor, places: Tensor) -> Tensor:

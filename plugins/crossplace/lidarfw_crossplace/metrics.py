@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
-from lidarfw.components.metrics.recall_at import precision_recall
+from lidarfw.components.metrics.recall_at import PlaceMetric, precision_recall, rank_of_first
 from lidarfw.components.metrics.sequence import sequence_number
 from lidarfw.errors import ConfigError
-from lidarfw.interfaces import Metric
-from lidarfw.types import Descriptors, FrameMeta, Spec, Targets
+from lidarfw.types import Spec
 from torch import Tensor
 
 DIRECTIONS = {"2d3d": ("camera", "lidar"), "3d2d": ("lidar", "camera"), "2d2d": ("camera",) * 2, "3d3d": ("lidar",) * 2}
@@ -19,7 +18,7 @@ QUERIES = 512  # at a time
 _CAMERA = 1.0
 
 
-class PlaceRecall(Metric):
+class PlaceRecall(PlaceMetric):
     """Place recognition across sensors: each of four directions, query to map: 2d3d, 3d2d, 2d2d, 3d3d.
 
     Which frames are queries and which the map: with `map_sequences`, these sequences are the map and all others query.
@@ -37,8 +36,6 @@ class PlaceRecall(Metric):
 
     monitor: ClassVar[str] = "recall@1"
     higher_is_better = True
-    vectors: list[Tensor]  # (F, D)
-    places: list[Tensor]  # (F, 5): sequence, time, x, y, 1 for camera and 0 for LiDAR
 
     def __init__(
         self,
@@ -51,47 +48,21 @@ class PlaceRecall(Metric):
         apart: float = 0.0,
         exclude_hopeless: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(descriptors)
         if not radii or min(*radii, *counts, spacing) <= 0 or apart < 0:
             raise ConfigError(
                 f"metric.place_recall: radii, counts and spacing must be above 0 and apart at least 0, "
                 f"got {list(radii)}, {list(counts)}, {spacing} and {apart}"
             )
-        self.channels, self.radii, self.counts = descriptors.channels, list(radii), sorted({1, *counts})
+        self.radii, self.counts = list(radii), sorted({1, *counts})
         self.map = [sequence_number(str(name)) for name in map_sequences]
         self.spacing, self.apart, self.exclude_hopeless = spacing, apart, exclude_hopeless
-        self.add_state("vectors", default=[], dist_reduce_fx="cat")
-        self.add_state("places", default=[], dist_reduce_fx="cat")
-        self._start()
-
-    def _start(self) -> None:
-        # never an empty list: processes that saw no frame must take part in the exchange of the others
-        self.vectors.append(torch.zeros(0, self.channels, device=self.device))
-        self.places.append(torch.zeros(0, 5, dtype=torch.float64, device=self.device))
-
-    def reset(self) -> None:
-        """Forget all frames."""
-        super().reset()
-        self._start()
-
-    def update(self, descriptors: Descriptors, targets: Targets, meta: list[FrameMeta]) -> None:
-        """Take the descriptors of one frame, or of a batch of frames, in; those without a pose are left out."""
-        if targets.poses is None:
-            return
-        rows = [(sequence_number(f.sequence), f.time, float(f.modality == "camera")) for f in meta]
-        where = torch.tensor(rows, dtype=torch.float64, device=self.device).view(-1, 3)
-        position = targets.poses.matrix[:, :2, 3].double().to(self.device)
-        known = targets.poses.ok.to(self.device)
-        self.vectors.append(descriptors.vector.detach().float().to(self.device)[known])
-        self.places.append(torch.cat([where[:, :2], position, where[:, 2:]], 1)[known])
 
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""
-        vectors, places = (
-            torch.cat(state) if isinstance(state, list) else state for state in (self.vectors, self.places)
-        )
+        vectors, places = self.gathered()
         asking, asked = self._roles(places)
-        camera = places[:, 4] == _CAMERA
+        camera = places[:, 5] == _CAMERA
         figures: dict[str, float] = {}
         for name, (query, map_) in DIRECTIONS.items():
             rows, base = asking & (camera == (query == "camera")), asked & (camera == (map_ == "camera"))
@@ -109,8 +80,8 @@ class PlaceRecall(Metric):
             in_map = torch.isin(places[:, 0], places.new_tensor(self.map))
             return ~in_map, in_map
         queries = torch.zeros(len(places), dtype=torch.bool)
-        for key in torch.unique(places[:, [0, 4]], dim=0):
-            rows = (places[:, [0, 4]] == key).all(1).nonzero()[:, 0]
+        for key in torch.unique(places[:, [0, 5]], dim=0):
+            rows = (places[:, [0, 5]] == key).all(1).nonzero()[:, 0]
             rows = rows[places[rows, 1].argsort(stable=True)]
             queries[rows.cpu()] = spaced(places[rows, 2:4].cpu(), self.spacing)
         queries = queries.to(places.device)
@@ -148,10 +119,8 @@ class PlaceRecall(Metric):
         ties = metres.masked_fill(~searched | (distance > best[:, None]), -torch.inf).amax(1)
         columns = [best, torch.where(best.isfinite(), ties, torch.inf)]
         for radius in self.radii:
-            right = searched & (metres < radius)
-            nearest = distance.masked_fill(~right, torch.inf).amin(1, keepdim=True)
-            before = (searched & ~right & (distance <= nearest)).sum(1)
-            columns += [torch.where(right.any(1), before + 1.0, torch.inf), right.any(1)]
+            rank = rank_of_first(metres < radius, searched, distance)
+            columns += [rank, rank.isfinite()]
         return torch.stack([column.double() for column in columns], 1)
 
 
