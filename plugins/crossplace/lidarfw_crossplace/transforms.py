@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from lidarfw_crossplace import labels, panorama
+    from lidarfw_crossplace import labels, networks, panorama
 else:
     torch = LazyModule("torch")
+    networks = LazyModule("lidarfw_crossplace.networks")
     labels = LazyModule("lidarfw_crossplace.labels")
     panorama = LazyModule("lidarfw_crossplace.panorama")
 
@@ -37,8 +38,10 @@ class Panorama(Transform):
 
     Scan: the nearest point of each pixel, range / `farthest`, gaps of a column filled. Camera: the fisheyes stitched by
     their calibration; depth from CAMERA_depth, raised to `power`; semantics from CAMERA_semantics. These two are the
-    truth of a simulated rig, and are made as uncertain as networks for single pictures are. Classes of points are those
-    of the targets, or of the pictures that see them.
+    truth of a simulated rig, and are made as uncertain as networks for single pictures are; with `depth_network` and
+    `semantics_network` they come from networks instead. Classes of points are those of the targets, or of the pictures
+    that see them. What networks say is kept in `cache`, by `lidarfw prepare` for all frames that are trained on, in
+    parallel, and for others when they are first asked for; what is there is not made again.
     """
 
     example: ClassVar[dict[str, Any]] = {"maps": ("intensity",), "cameras": ("image",), "width": 128, "height": 16}
@@ -60,6 +63,11 @@ class Panorama(Transform):
         power: float = 5.0,
         ego_mask: str = "",
         ego_fill: str = "inpaint",
+        depth_network: str = "",
+        semantics_network: str = "",
+        inpaint_network: str = "",
+        cache: str = "",
+        sphere: int = 1024,
     ) -> None:
         """Options.
 
@@ -68,7 +76,9 @@ class Panorama(Transform):
         points. gap: rows of a column that are filled between two points, negative for any. cameras: inputs to stitch.
         fov: of a camera, radians. power: of the depth of pictures. ego_mask: picture, white where the own vehicle is;
         made from the frames if it is not there; empty for none. ego_fill: inpaint or zero, for intensity and depth of
-        cameras; the classes there are road.
+        cameras; the classes there are road. depth_network, semantics_network: of the library transformers, by name or
+        folder. inpaint_network: TorchScript file of LaMa, instead of the classical inpainting. cache: folder for what
+        these say. sphere: columns of the panorama that they look at.
         """
         unknown = [name for name in maps if name not in CHANNELS]
         if unknown or not maps or ego_fill not in FILLS:
@@ -80,18 +90,27 @@ class Panorama(Transform):
         self.view = RangeView(height, width, up, down)
         self.nearest, self.farthest, self.gap, self.fov, self.power = nearest, farthest, gap, fov, power
         self.ego_mask, self.ego_fill = ego_mask, ego_fill
+        self.networks = {"depth": depth_network, "semantics": semantics_network, "inpaint": inpaint_network}
+        self.cache, self.sphere = cache, sphere
+        if any(self.networks.values()) and not cache:
+            raise ConfigError(
+                "transform 'panorama': networks need a folder for what they say\n"
+                "  fix: transform.panorama.cache=runs/panoramas"
+            )
         self.classes: tuple[str, ...] = ()
 
     def spec(self, data: DataSpec) -> DataSpec:
         """The panoramas instead of what the sensors gave. ConfigError where an input is missing."""
-        kinds = [""] + [f"_{kind}" for kind in ("depth", "semantics") if kind in self.maps]
+        simulated = [kind for kind in ("depth", "semantics") if kind in self.maps and not self.networks[kind]]
+        kinds = [""] + [f"_{kind}" for kind in simulated]
         pictures = [f"{name}{kind}" for name in self.cameras for kind in kinds]
         seeing = any(name in data.inputs for name in self.cameras)
         missing = [name for name in pictures if name not in data.inputs]
         if missing and (seeing or "points" not in data.inputs):
             raise ConfigError(
                 f"transform 'panorama' needs the input {missing[0]}; there are {', '.join(data.inputs)}\n"
-                "  fix: give depth and semantics by the dataset, or transform.panorama.maps=[intensity]"
+                "  fix: transform.panorama.maps=[intensity], or depth and semantics by the dataset, or by depth_network and\n"
+                "       semantics_network"
             )
         channels = {name: CHANNELS[name] for name in self.maps}
         channels = {"panorama": sum(channels.values())} if self.stack else channels
@@ -103,7 +122,7 @@ class Panorama(Transform):
         self.classes = tuple(dataset.spec.classes)
 
     def prepare(self, dataset: Dataset, workers: int = 1) -> None:
-        """Make the mask of the own vehicle from frames of the dataset, unless it stands."""
+        """Make the mask of the own vehicle from frames of the dataset, unless it stands, and ask the networks."""
         if self.ego_mask and not Path(self.ego_mask).is_file():
             from lidarfw.draw import write_png
 
@@ -111,6 +130,24 @@ class Panorama(Transform):
             greys = torch.stack([self._grey(dataset[int(number)]) for number in np.unique(steps)])
             still = (greys.std(0, correction=0) < _EGO_MOVES) & (greys.mean(0) > 0)
             write_png(self.ego_mask, np.repeat((still[0].numpy() * np.uint8(255))[..., None], 3, 2))
+        if any(self.networks.values()):
+            self._ask_all(dataset, workers)
+
+    def _ask_all(self, dataset: Dataset, workers: int) -> None:
+        """Ask the networks about every frame that is not in the cache, `workers` frames at a time."""
+        from rich.progress import track
+
+        metas = [dataset.meta(number) for number in range(len(dataset))]
+        missing = [
+            number
+            for number, meta in enumerate(metas)
+            if meta.modality != "lidar" and not networks.file_of(self.cache, meta.id).is_file()
+        ]
+        work = torch.utils.data.DataLoader(  # its processes are started, fed and ended by torch
+            networks.Work(self, dataset, missing), None, num_workers=workers if workers > 1 else 0
+        )
+        for _ in track(work, "networks look at pictures", total=len(missing), transient=True):
+            pass
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """The frame with panoramas as its inputs."""
@@ -158,38 +195,87 @@ class Panorama(Transform):
     # the cameras
 
     def _camera_maps(self, frame: Frame, rng: np.random.Generator) -> dict[str, Tensor]:
-        makers = {"intensity": lambda: self._grey(frame), "depth": lambda: self._depth(frame, rng),
-                  "semantics": lambda: self._semantics(frame, rng)}  # fmt: skip
+        said = self.said(frame)
+        makers = {"intensity": lambda: self._grey(frame) if said.intensity is None else said.intensity[None],
+                  "depth": lambda: self._depth(frame, rng, said) ** self.power,
+                  "semantics": lambda: self._semantics(frame, rng, said)}  # fmt: skip
         return {name: makers[name]() for name in self.maps}
 
-    def _pictures(self, frame: Frame, kind: str = "") -> tuple[panorama.Stitcher, list[Tensor]]:
+    def said(self, frame: Frame) -> networks.Said:
+        """What networks say of the pictures of a frame: from the cache, else asked now and kept."""
+        if not any(self.networks.values()):
+            return networks.Said()
+        path, settings = networks.file_of(self.cache, frame.meta.id), f"{self.networks} {self.view} {self.sphere}"
+        if path.is_file():
+            return networks.Said.load(path, settings)
+        said = self._ask(frame)
+        said.save(path, settings)
+        return said
+
+    def _ask(self, frame: Frame) -> networks.Said:
+        """Let the networks look at the whole stitched panorama, and cut out what the LiDAR sees."""
+        whole = panorama.sphere(self.sphere)
+        stitcher, pictures = self._pictures(frame, view=whole)
+        picture, crop = stitcher.blend(pictures), panorama.stitcher(self.view, (panorama.camera_of(whole),), math.pi)
+        said = networks.Said()
+        if self._depth_network and "depth" in self.maps:
+            inverse = crop.blend([self._depth_network(picture)[None]])[0]
+            covered = crop.blend([stitcher.covered[None].float()])[0] > 0.5
+            said.depth = self._filled(panorama.depth_from_inverse(inverse, covered & ~self._ego)[None])[0]
+        if self._semantics_network and "semantics" in self.maps:
+            said.classes = crop.pick([self._semantics_network(picture)[None].float()])[0].to(torch.uint8)
+        if self._inpaint_network and "intensity" in self.maps:
+            said.intensity = self._grey(frame)[0]
+        return said
+
+    @functools.cached_property
+    def _depth_network(self) -> networks.DepthNetwork | None:
+        return networks.DepthNetwork(self.networks["depth"]) if self.networks["depth"] else None
+
+    @functools.cached_property
+    def _semantics_network(self) -> networks.SemanticNetwork | None:
+        return networks.SemanticNetwork(self.networks["semantics"]) if self.networks["semantics"] else None
+
+    @functools.cached_property
+    def _inpaint_network(self) -> networks.InpaintingNetwork | None:
+        return networks.InpaintingNetwork(self.networks["inpaint"]) if self.networks["inpaint"] else None
+
+    def _pictures(
+        self, frame: Frame, kind: str = "", view: RangeView | None = None
+    ) -> tuple[panorama.Stitcher, list[Tensor]]:
         missing = [name for name in self.cameras if f"{name}{kind}" not in frame.inputs]
         if missing:
             raise DataError(f"frame {frame.meta.id} has no input {missing[0]}{kind}; it has {', '.join(frame.inputs)}")
         images = [frame.inputs[f"{name}{kind}"] for name in self.cameras]
         rig = tuple(image.cameras[0] for image in images)
-        return panorama.stitcher(self.view, rig, self.fov), [image.features[0] for image in images]
+        return panorama.stitcher(view or self.view, rig, self.fov), [image.features[0] for image in images]
 
     def _grey(self, frame: Frame) -> Tensor:
         stitcher, pictures = self._pictures(frame)
         return self._filled(panorama.grey(stitcher.blend(pictures)))
 
-    def _depth(self, frame: Frame, rng: np.random.Generator) -> Tensor:
+    def _depth(self, frame: Frame, rng: np.random.Generator, said: networks.Said) -> Tensor:
+        if said.depth is not None:
+            return said.depth[None]
         stitcher, pictures = self._pictures(frame, "_depth")
         inverse = panorama.simulated_inverse_depth(stitcher.pick(pictures)[0], rng)
         depth = panorama.depth_from_inverse(inverse, stitcher.covered & ~self._ego)
-        return self._filled(depth[None]) ** self.power
+        return self._filled(depth[None])
 
-    def _semantics(self, frame: Frame, rng: np.random.Generator) -> Tensor:
-        stitcher, pictures = self._pictures(frame, "_semantics")
-        classes = labels.kitti_360_table()[stitcher.pick(pictures)[0].long()]
-        said = labels.simulated_labels(torch.where(stitcher.covered, classes, labels.NOTHING), rng)
-        return labels.coloured(torch.where(self._ego, labels.ROAD, said).to(torch.uint8))
+    def _semantics(self, frame: Frame, rng: np.random.Generator, said: networks.Said) -> Tensor:
+        classes = said.classes
+        if classes is None:
+            stitcher, pictures = self._pictures(frame, "_semantics")
+            truth = labels.kitti_360_table()[stitcher.pick(pictures)[0].long()]
+            classes = labels.simulated_labels(torch.where(stitcher.covered, truth, labels.NOTHING), rng)
+        return labels.coloured(torch.where(self._ego, labels.ROAD, classes).to(torch.uint8))
 
     def _filled(self, values: Tensor) -> Tensor:
         """A map (1, H, W) without the own vehicle."""
         if self.ego_fill == "zero":
             return torch.where(self._ego, 0, values)
+        if self._inpaint_network and bool(self._ego.any()):
+            return self._inpaint_network(values[0], self._ego)[None]
         return panorama.inpainted(values[0], self._ego)[None]
 
     @functools.cached_property
