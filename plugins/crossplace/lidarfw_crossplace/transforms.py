@@ -109,8 +109,8 @@ class Panorama(Transform):
         if missing and (seeing or "points" not in data.inputs):
             raise ConfigError(
                 f"transform 'panorama' needs the input {missing[0]}; there are {', '.join(data.inputs)}\n"
-                "  fix: transform.panorama.maps=[intensity], or depth and semantics by the dataset, or by depth_network and\n"
-                "       semantics_network"
+                "  fix: transform.panorama.maps=[intensity], or depth and semantics by the dataset or by networks\n"
+                "       (depth_network, semantics_network)"
             )
         channels = {name: CHANNELS[name] for name in self.maps}
         channels = {"panorama": sum(channels.values())} if self.stack else channels
