@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Moving objects by geometry alone: what a learned method of moving-object segmentation has to beat.
 
-python tools/mos_baseline.py --tune TOWN --test REAL [--past 4]
+python tools/mos_baseline.py --tune TOWN --test REAL [--past 4] [--search 1]
 
 TOWN, REAL: folders in SemanticKITTI's layout. A point counts as moving where at least `agreeing` of the `past` last
 scans, moved into the frame of the current one, look further than it does by more than a share of its range: something
 stands where the beams went through before. That is the signed residual of Chen et al., "Moving object segmentation in
 3D LiDAR data", RA-L 2021, equation 1, and a threshold. `agreeing` and the threshold are those of the highest IoU on
-TOWN; REAL is only measured. Beside it: the figures of calling all points of movable classes moving, which needs the
+TOWN; REAL is only measured. With `--search` N the range of a past scan is that within N pixels which is nearest to
+the current one. Beside it: the figures of calling all points of movable classes moving, which needs the
 labels.
 
 Scans that have fewer than `past` scans before them, and points without a label, do not count.
@@ -98,7 +99,7 @@ class Tally:
         return Figures.of(self.movable[1], self.movable[0], int(self.moving[0].sum()))
 
 
-def residuals(frame: Frame, past: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+def residuals(frame: Frame, past: int, search: int = 0) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
     """Signed residuals (past, N) of the points of the current scan, and which points of the frame those are."""
     points = frame.inputs["points"]
     if points.time is None:
@@ -107,7 +108,7 @@ def residuals(frame: Frame, past: int) -> tuple[npt.NDArray[np.float32], npt.NDA
     current = points.time == times[0]
     image = range_project(points[current], VIEW)
     earlier = [points[points.time == time] for time in times[1 : past + 1]]
-    change = residual_images(image, earlier, farthest=FARTHEST, signed=True)[0].flatten(1)
+    change = residual_images(image, earlier, farthest=FARTHEST, signed=True, search=search)[0].flatten(1)
     pixel = image.pixel.clamp(min=0)
     depth = points[current].xyz.norm(dim=1) - image.features[0, 0].flatten()[pixel]
     seen = (image.pixel >= 0) & (depth < SAME)
@@ -121,7 +122,7 @@ def labels(frame: Frame) -> Counts:
     return np.asarray(frame.targets.points.label.numpy())
 
 
-def tally(root: str, past: int, split: str = "all") -> Tally:
+def tally(root: str, past: int, split: str = "all", search: int = 0) -> Tally:
     """Count all scans of a folder; DataError where no sequence is long enough."""
     options: dict[str, Any] = {"root": root, "split": split}
     moving = SemanticKittiDataset(**options, task="moving", sweeps=past + 1)
@@ -133,7 +134,7 @@ def tally(root: str, past: int, split: str = "all") -> Tally:
         raise DataError(f"{root}: no sequence has more than {past} scans.\n  fix: --past {max(past - 1, 1)}")
     whole = Tally(past)
     for index in progress(judged, description=root, disable=not sys.stderr.isatty()):
-        residual, current = residuals(moving[index], past)
+        residual, current = residuals(moving[index], past, search)
         label = labels(moving[index])[current]
         kind = torch.from_numpy(labels(semantics[index]))
         whole.add(residual, label, (table[kind.clamp(min=0)] & (kind >= 0)).numpy())
@@ -146,11 +147,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tune", required=True, help="folder of the scans that the threshold is chosen on")
     parser.add_argument("--test", required=True, nargs="+", help="folders of the scans that are measured")
     parser.add_argument("--past", type=int, default=4, help="past scans (default: 4)")
+    parser.add_argument("--search", type=int, default=0, help="pixels around, in past scans (default: 0)")
     given = parser.parse_args(arguments)
     try:
-        tuned = tally(given.tune, given.past)
+        tuned = tally(given.tune, given.past, search=given.search)
         agreeing, threshold = tuned.best()
-        rows = [(given.tune, tuned), *((root, tally(root, given.past)) for root in given.test)]
+        rows = [(given.tune, tuned), *((root, tally(root, given.past, search=given.search)) for root in given.test)]
     except LidarfwError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
