@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -18,7 +19,8 @@ from lidarfw.types import BEV, Batch, DataSpec, Frame, Points, Poses, SceneCoord
 from torch import Tensor
 
 from lidarfw_taco.backbones.taco import TacoBackbone
-from lidarfw_taco.heads.scene_coord import SceneCoordBEVHead, SceneCoordHead, SceneCoordOutput
+from lidarfw_taco.heads.regions import Regions
+from lidarfw_taco.heads.scene_coord import CoordinateRegressor, SceneCoordBEVHead, SceneCoordHead, SceneCoordOutput
 from lidarfw_taco.losses.scene_coord import SceneCoordLoss, true_places
 from lidarfw_taco.necks.gated_fusion import averaged
 from lidarfw_taco.transforms.random_shift import RandomShift
@@ -179,6 +181,63 @@ def test_true_place_of_a_point() -> None:
     torch.testing.assert_close(place, torch.tensor([[8.0, 1.0, 3.0]]))
     torch.testing.assert_close(place - torch.tensor([5.0, 0, 0]), torch.tensor([[3.0, 1.0, 3.0]]))
     torch.testing.assert_close(place - torch.tensor([5.0, 0, 0]) - source, torch.tensor([[2.0, -1.0, 0.0]]))
+
+
+# regions
+
+
+def poses_at(*places: float, ok: bool = True, turned: bool = False) -> Poses:
+    matrix = torch.eye(4).repeat(len(places), 1, 1)
+    matrix[:, 0, 3] = torch.tensor(places)
+    if turned:
+        matrix[:, :2, :2] = torch.tensor([[-1.0, 0], [0, -1]])
+    return Poses(matrix, torch.full((len(places),), ok), torch.ones(len(places)))
+
+
+def test_regions_are_founded_where_none_is_near() -> None:
+    regions = Regions(4, 4, size=8.0)
+    regions.found(poses_at(0.0, 5.0, 9.0, 14.0))
+    regions.found(poses_at(1.0, turned=True))
+    regions.found(poses_at(500.0, ok=False))
+    assert int(regions.founded) == 3
+    assert regions.poses[:3, 0, 3].tolist() == [0, 9, 1]
+    assert regions.of(poses_at(4.0, 6.0, 100.0)).tolist() == [0, 1, 1]
+    assert regions.of(poses_at(4.0, turned=True)).tolist() == [2]
+    assert regions.of(poses_at(4.0, ok=False)).tolist() == [-1]
+    regions.found(poses_at(100.0, 200.0, 300.0))
+    assert int(regions.founded) == 4  # full
+    logits = Regions(4, 4, size=8.0).eval()(torch.randn(5, 4), torch.tensor([0, 0, 0, 1, 1]), 2)
+    assert logits.argmax(1).tolist() == [0, 0]  # nothing else is known yet
+
+
+@pytest.mark.parametrize("target", ["absolute", "shift", "affine"])
+def test_places_are_measured_from_the_region(target: str) -> None:
+    regressor = CoordinateRegressor(4, 8, 8, target, regions=2, region_size=8.0).train()
+    cells = SceneCoords(torch.randn(6, 3), torch.zeros(6, 3), torch.ones(6), torch.arange(6) // 3, 2)
+    poses = Poses(torch.stack([torch.eye(4), quarter_turn(50.0)]), torch.ones(2, dtype=torch.bool), torch.ones(2))
+    regressor.calibrate(cells.source, cells.batch, poses)
+    torch.nn.init.zeros_(regressor.last.weight)
+    torch.nn.init.zeros_(regressor.last.bias)
+    found = regressor(torch.randn(6, 4), cells, poses)
+    assert found.region is not None
+    assert found.region.tolist() == [0, 1]
+    local = torch.zeros_like(cells.source) if target == "absolute" else cells.source
+    torch.testing.assert_close(found.world, transform(poses.matrix[cells.batch], local[:, None])[:, 0])
+
+
+def test_the_loss_of_regions_counts_scans_with_a_pose() -> None:
+    logits = torch.tensor([[0.0, 0.0], [5.0, 0.0]], requires_grad=True)
+    output = dataclasses.replace(pairs(torch.zeros(1, 3)), region_logits=logits, region=torch.tensor([1, -1]))
+    term = SceneCoordLoss(Spec(SceneCoords))(output, known(torch.eye(4)))["region"]
+    assert term.item() == pytest.approx(math.log(2))
+    none = dataclasses.replace(output, region=torch.tensor([-1, -1]))
+    assert SceneCoordLoss(Spec(SceneCoords))(none, known(torch.eye(4)))["region"].item() == 0
+
+
+@pytest.mark.parametrize("options", [{"regions": -1}, {"regions": 4, "region_size": 0.0}])
+def test_regions_say_what_they_need(options: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="region_size"):
+        SceneCoordHead(Spec(Voxels, 8, 8, TacoBackbone(POINTS, **TINY).grid), POINTS, hidden=8, **options)
 
 
 # the loss

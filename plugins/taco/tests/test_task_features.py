@@ -6,9 +6,11 @@ import pytest
 import torch
 from lidarfw.assembly import build, plan
 from lidarfw.config import compose
+from lidarfw.errors import ConfigError
 from lidarfw.testing.synthetic import SyntheticDataset
 from lidarfw.types import BEV, Boxes, Grid, Spec, Targets, collate, take
 
+from lidarfw_taco.metrics.motion_ap import MotionAP
 from lidarfw_taco.metrics.task_features import TaskFeatures, neighbors
 
 GRID = Grid((0.0, 0.0, -2.0), (8.0, 8.0, 2.0), (1.0, 1.0, 1.0))
@@ -127,3 +129,29 @@ def _figure(model, batch, figure: str) -> float:
     with torch.no_grad():
         model.eval().update_metrics(model.predict(batch))
     return model.compute_metrics()[f"task_features/{figure}"]
+
+
+# average precision by motion state
+
+
+def test_precision_of_moving_and_of_static_objects() -> None:
+    """Of two parked cars one is found, of two moving ones both; a false detection counts for either."""
+    truth = boxes((1, 1, 0, 0), (1, 5, 0, 0), (5, 1, 0, 1), (5, 5, 0, 1), (7, 7, 0, -1))
+    found = boxes((1, 1, 0, 0), (5, 1, 0, 0), (5, 5, 0, 0), (3, 3, 0, 0), (7, 7, 0, 0)).replace(moving=None)
+    found = found.replace(score=torch.tensor([0.9, 0.8, 0.7, 0.6, 0.95]))
+    spec = Spec(Boxes, classes=("Car",))
+    expected = {"moving": 1.0, "static": 0.5}
+    for motion, precision in expected.items():
+        metric = MotionAP(spec, motion=motion, iou={"Car": 0.5})
+        metric.update(found, Targets(truth))
+        assert metric.compute()["car_3d_ap"] == pytest.approx(precision)
+
+
+def test_precision_by_motion_needs_motion() -> None:
+    metric = MotionAP(Spec(Boxes, classes=("Car",)))
+    metric.update(Boxes.empty(), Targets(Boxes.empty()))
+    assert metric.compute()["mean_3d_ap"] == 0
+    with pytest.raises(ConfigError, match="what moves"):
+        metric.update(Boxes.empty(), Targets(boxes((1, 1, 0, 0)).replace(moving=None)))
+    with pytest.raises(ConfigError, match="moving, static"):
+        MotionAP(Spec(Boxes, classes=("Car",)), motion="parked")

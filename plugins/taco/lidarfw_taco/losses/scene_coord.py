@@ -8,6 +8,7 @@ from lidarfw.interfaces import Loss
 from lidarfw.ops import points_in_boxes, transform
 from lidarfw.types import Boxes, Poses, SceneCoords, Spec, Targets
 from torch import Tensor
+from torch.nn.functional import cross_entropy
 
 from lidarfw_taco.heads.scene_coord import SceneCoordOutput
 
@@ -18,6 +19,8 @@ class SceneCoordLoss(Loss):
     Term `l1`: the sum over x, y, z, averaged over all pairs of the batch by their weights; frames without a pose
     count nothing. `moving_weight` is multiplied to pairs on objects that are labelled as moving: 0 leaves them out,
     for they have left when the place is seen again. `clamp` bounds the error of a pair in metres; 0 does not.
+
+    Term `region`, of heads with regions: the cross-entropy of the region that each scan was taken in.
     """
 
     def __init__(self, scene_coord: Spec, *, moving_weight: float = 1.0, clamp: float = 0.0) -> None:
@@ -40,7 +43,17 @@ class SceneCoordLoss(Loss):
         if self.moving_weight != 1:
             weight = weight * torch.where(_on_moving(pairs, targets.boxes), self.moving_weight, 1.0)
         error = torch.where(weight > 0, error, 0)  # where no pose is known the error may be anything
-        return {"l1": (weight * error).sum() / weight.sum().clamp(min=1)}
+        terms = {"l1": (weight * error).sum() / weight.sum().clamp(min=1)}
+        return terms | _region_term(scene_coord)
+
+
+def _region_term(scene_coord: SceneCoordOutput) -> dict[str, Tensor]:
+    """Cross-entropy of the regions, averaged over the scans whose pose is known."""
+    logits, region = scene_coord.region_logits, scene_coord.region
+    if logits is None or region is None:
+        return {}
+    total = cross_entropy(logits, region, ignore_index=-1, reduction="sum")
+    return {"region": total / (region >= 0).sum().clamp(min=1)}
 
 
 @torch.no_grad()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from lidarfw.components.layers import BatchNorm1d
 from lidarfw.interfaces import Neck
-from lidarfw.ops import find_voxels, scatter_mean
+from lidarfw.ops import find_voxels, scatter_mean, to_dense
 from lidarfw.types import Spec, Voxels
 from torch import Tensor, nn
 
@@ -27,22 +27,41 @@ class _Gate(nn.Module):
         return gated
 
 
+class _Layout(nn.Module):
+    """A vector (B, `channels`) for each scan: what stands where around the sensor."""
+
+    CELLS, WIDTH = 16, 8  # of the map that is read, to each side, and its channels at each height
+
+    def __init__(self, voxels: Spec, channels: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Sequential(nn.Linear(voxels.channels, self.WIDTH), BatchNorm1d(self.WIDTH), nn.ReLU())
+        width = self.WIDTH * voxels.depth * self.CELLS**2
+        self.read = nn.Sequential(nn.Linear(width, channels), nn.LayerNorm(channels), nn.ReLU())
+
+    def forward(self, voxels: Voxels) -> Tensor:
+        seen = to_dense(voxels.with_features(self.squeeze(voxels.features))).flatten(1, 2)  # every height is there
+        vector: Tensor = self.read(nn.functional.adaptive_max_pool2d(seen, self.CELLS).flatten(1))
+        return vector
+
+
 class GatedFusion(Neck):
     """Voxels of several strides -> voxels of the coarsest one, with the finer levels added through gates (LiSA).
 
     Each finer level is averaged over the coarse cells, brought to `channels` and weighted by a gate 0..1; the
     deepest level and all of these stand side by side. Every level has a gate of its own.
 
-    With `context`, so many channels that say what the whole scan looks like (a layer on the deepest level, averaged
-    over the scan) stand beside the features of every voxel: a place is known sooner from the scan than from a voxel.
-    LightLoc (CVPR 2025, section 3.2) guides scene coordinates by the class of the scan in the same spirit.
+    With `context`, so many channels that say what stands where around the sensor stand beside the features of every
+    voxel (ours): a place is known from the whole scan sooner than from a voxel, and from its layout sooner than from
+    an average over the scan, which cannot tell where in it something is. They are read by one linear layer from the
+    level before the deepest, pooled to 16 x 16 columns with all heights. LightLoc (CVPR 2025, section 3.2) guides
+    scene coordinates by the whole scan as well.
     """
 
     def __init__(self, voxels: list[Spec], *, channels: int = 128, context: int = 0) -> None:
         super().__init__()
         *fine, deepest = sorted(voxels, key=lambda spec: spec.stride)
         self.gates = nn.ModuleList(_Gate(spec.channels, deepest.channels, channels) for spec in fine)
-        self.context = _context(deepest.channels, context) if context else None
+        self.context = _Layout([*fine, deepest][-2:][0], context) if context else None
         width = deepest.channels + channels * len(fine) + context
         self.provides = Spec(Voxels, width, deepest.stride, deepest.geometry, depth=deepest.depth)
 
@@ -53,13 +72,8 @@ class GatedFusion(Neck):
         for gate, level in zip(self.gates, fine, strict=True):
             parts.append(gate(averaged(level, deepest), deepest.features))
         if self.context is not None:
-            batch = deepest.index[:, 0]
-            parts.append(scatter_mean(self.context(deepest.features), batch, deepest.batch_size)[batch])
+            parts.append(self.context([*fine, deepest][-2:][0])[deepest.index[:, 0]])
         return deepest.with_features(torch.cat(parts, 1))
-
-
-def _context(in_channels: int, channels: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(in_channels, channels, bias=False), BatchNorm1d(channels), nn.ReLU())
 
 
 def averaged(fine: Voxels, coarse: Voxels) -> Tensor:
