@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lidarfw import draw
+from lidarfw import draw, kitti
 from lidarfw.detections import Detections
+from lidarfw.errors import DataError
 from lidarfw.files import write_text
+from lidarfw.io import read_image
 from lidarfw.types import Tracks
 
 Frames = Sequence[tuple[Detections, Tracks]]
 Array = npt.NDArray[np.float64]
 
 TAIL = 20  # frames
+_STRIP = 880  # pixels, width of the pictures of the camera
 
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>%(title)s</title><style>
 body { font: 15px/1.4 system-ui, sans-serif; color: #1b1f24; margin: 1em auto; max-width: 1280px; padding: 0 1em; }
@@ -32,12 +35,12 @@ h1 { font-size: 1.3em; margin: 0 0 .4em; } p { color: #59636e; margin: .3em 0; }
 #view { display: flex; gap: 1em; align-items: flex-start; } canvas { border: 1px solid #ddd; background: #fbfbfa; }
 table { border-collapse: collapse; font-size: .88em; } td, th { padding: .1em .7em .1em 0; text-align: left; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; } tr.on { font-weight: 700; }
-#side { max-height: 720px; overflow-y: auto; min-width: 270px; } img { max-width: 100%%; }
+#strip { width: 100%%; } #side { max-height: 720px; overflow-y: auto; min-width: 270px; } img { max-width: 100%%; }
 button { font: inherit; padding: .2em .9em; } #least { width: 4.5em; }
 </style><h1>%(title)s</h1>
 <div id="bar"><button id="play">Play</button><input id="slide" type="range" min="0" value="0"><span id="where"></span>
 <label>score from <input id="least" type="number" min="0" max="1" step="0.05" value="0"></label></div>
-<div id="view"><canvas id="c" width="880" height="720"></canvas><div id="side"></div></div>
+%(strip)s<div id="view"><canvas id="c" width="880" height="720"></canvas><div id="side"></div></div>
 <p>Seen from above, ahead is up; circles every 20 m. Each track has a colour, its number and a tail of %(tail)s frames.
 Arrow keys step, space plays, the wheel zooms, a click on a box or a row follows it.</p>
 <h2>The whole sequence</h2><img src="data:image/png;base64,%(overview)s" alt="all tracks from above">
@@ -87,6 +90,9 @@ function paint() {
     cell(D.classes[b[1]], "") + cell(b[2].toFixed(2), "n") + cell(far(b).toFixed(0) + " m", "n") + "</tr>");
   document.getElementById("side").innerHTML =
     "<table><tr><th>track</th><th>class</th><th>score</th><th>distance</th></tr>" + rows.join("") + "</table>";
+  const strip = document.getElementById("strip"), shot = D.pictures[at];
+  if (strip) strip.style.visibility = shot ? "visible" : "hidden";
+  if (strip && shot) strip.src = "data:image/jpeg;base64," + shot;
   document.getElementById("where").textContent = "frame " + D.index[at] + " / " + D.index[D.index.length - 1];
   slide.value = at;
 }
@@ -115,11 +121,12 @@ paint();
 """
 
 
-def write_page(path: str | Path, name: str, frames: Frames, classes: Sequence[str]) -> None:
+def write_page(path: str | Path, name: str, frames: Frames, classes: Sequence[str], images: Path | None = None) -> None:
     """A page of a sequence: a bird's-eye view with a slider, its tracks with number, tail and score, and `overview`.
 
     Self-contained HTML without outside links; `#40` after its address opens it at the 41st frame. Without poses tails
-    are drawn as if the sensor stood still.
+    are drawn as if the sensor stood still. `images` is a folder of the camera's pictures, by number of the frame
+    (000000.png): the tracks are drawn on them too, with their numbers. DataError where it has none of the sequence.
     """
     rows = [_rows(tracks) for _, tracks in frames]
     back, ahead = np.percentile([0.0, *(row[3] for frame in rows for row in frame)], [2, 98]).tolist()
@@ -128,13 +135,37 @@ def write_page(path: str | Path, name: str, frames: Frames, classes: Sequence[st
         "index": [frame.meta.index for frame, _ in frames],
         "poses": [_place(frame) for frame, _ in frames],
         "frames": rows,
+        "pictures": [""] * len(rows) if images is None else _strip(images, frames, classes),
         "back": round(back, 1),
         "zoom": round(640 / max(ahead - back, 20), 2),
     }
     picture = base64.b64encode(draw.png_bytes(overview(name, frames))).decode()
     text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-    values = {"title": html.escape(name), "data": text, "tail": TAIL, "overview": picture}
+    strip = "" if images is None else '<img id="strip" alt="the tracks in the picture of the camera">\n'
+    values = {"title": html.escape(name), "data": text, "tail": TAIL, "overview": picture, "strip": strip}
     write_text(path, _PAGE % values)
+
+
+def _strip(folder: Path, frames: Frames, classes: Sequence[str]) -> list[str]:
+    """The camera's picture of every frame with its tracks, as the base64 of a JPEG; "" where there is none."""
+    found = [next(folder.glob(f"{frame.meta.index:06d}.*"), None) for frame, _ in frames]
+    if not any(found):
+        raise DataError(
+            f"{folder}: has no picture 000000.png or .jpg of the sequence.\n  fix: --images DIR/SEQUENCE/*.png"
+        )
+    return [
+        "" if path is None else _shot(path, frame, tracks, classes)
+        for path, (frame, tracks) in zip(found, frames, strict=True)
+    ]
+
+
+def _shot(path: Path, frame: Detections, tracks: Tracks, classes: Sequence[str]) -> str:
+    import cv2
+
+    view = draw.camera_view(read_image(path), kitti.camera_of(frame.meta.cameras, kitti.IMAGE), tracks, None, classes)
+    size = (_STRIP, round(view.shape[0] * _STRIP / view.shape[1]))
+    small = cv2.resize(view, size, interpolation=cv2.INTER_AREA)[..., ::-1]
+    return base64.b64encode(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()).decode()
 
 
 def _rows(tracks: Tracks) -> list[list[float]]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from lidarfw import cli, kitti
 from lidarfw.components.metrics.mot3d import Mot3D
@@ -77,6 +80,25 @@ def test_a_page_to_look_through(drive: Path) -> None:
     assert len(data["frames"]) == 8
     assert len(data["frames"][0]) == 2
     assert data["poses"][3][:2] == [3 * STEP, 0]
+
+
+def test_the_page_shows_the_pictures_of_the_camera(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the tracks drawn on them; frames without a picture have none."""
+    folder = drive / "images/0000"
+    folder.mkdir(parents=True)
+    for number in (0, 5):
+        Image.new("RGB", (1242, 375), (10, 20, 30)).save(folder / f"{number:06d}.png")
+    assert track(drive, "--poses", str(drive / "poses"), "--pictures", "--images", str(drive / "images")) == 0
+    page = (drive / "out/0000.html").read_text()
+    shots = json.loads(page.partition("const D = ")[2].partition(", TAIL")[0])["pictures"]
+    assert [bool(shot) for shot in shots] == [True, False, False, False, False, True, False, False]
+    shown = np.asarray(Image.open(io.BytesIO(base64.b64decode(shots[0]))))
+    assert shown.shape[1] == 880
+    assert (np.abs(shown.astype(int) - (10, 20, 30)).max(2) > 60).sum() > 50  # lines and numbers
+    assert track(drive, "--pictures", "--images", str(drive / "nothing")) == 2
+    assert "no picture" in capsys.readouterr().err
+    assert track(drive, "--images", str(drive / "images")) == 2
+    assert "--pictures" in capsys.readouterr().err
 
 
 def test_errors_name_file_and_fix(drive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sequences", metavar="NAME", nargs="+", help="only these (all)")
     parser.add_argument("--config-dir", metavar="DIR", help="folder with configs of your own")
     parser.add_argument("--pictures", action="store_true", help="also write a page to look through each sequence")
+    parser.add_argument("--images", metavar="DIR", type=Path, help="kitti: pictures SEQUENCE/000000.png for the pages")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -72,6 +73,8 @@ def _read(args: argparse.Namespace) -> tuple[list[DetectedSequence], tuple[str, 
         if args.root is None:
             raise DataError("nuScenes results need the tables for order and poses.\n  fix: --root ROOT/v1.0-trainval")
         return detections.read_nuscenes(args.detections, args.root)
+    if args.images and not args.pictures:
+        raise DataError("--images is for the pages of --pictures.\n  fix: add --pictures")
     if args.calib is None:
         raise DataError(
             "KITTI results hold 2D boxes, which need the calibrations.\n  fix: --calib DIR (with SEQUENCE.txt)"
@@ -115,4 +118,5 @@ def _write(
         if args.pictures:
             from lidarfw import track_page
 
-            track_page.write_page(args.output / f"{sequence.name}.html", sequence.name, rows, classes)
+            images = args.images / sequence.name if args.images else None
+            track_page.write_page(args.output / f"{sequence.name}.html", sequence.name, rows, classes, images)
