@@ -139,12 +139,16 @@ def test_precision_of_moving_and_of_static_objects() -> None:
     truth = boxes((1, 1, 0, 0), (1, 5, 0, 0), (5, 1, 0, 1), (5, 5, 0, 1), (7, 7, 0, -1))
     found = boxes((1, 1, 0, 0), (5, 1, 0, 0), (5, 5, 0, 0), (3, 3, 0, 0), (7, 7, 0, 0)).replace(moving=None)
     found = found.replace(score=torch.tensor([0.9, 0.8, 0.7, 0.6, 0.95]))
-    spec = Spec(Boxes, classes=("Car",))
-    expected = {"moving": 1.0, "static": 0.5}
-    for motion, precision in expected.items():
-        metric = MotionAP(spec, motion=motion, iou={"Car": 0.5})
-        metric.update(found, Targets(truth))
-        assert metric.compute()["car_3d_ap"] == pytest.approx(precision)
+    metric = MotionAP(Spec(Boxes, classes=("Car", "Pedestrian")), iou={"Car": 0.5})
+    metric.update(found, Targets(truth))
+    figures = metric.compute()
+    assert figures["moving_car_3d_ap"] == pytest.approx(1.0)
+    assert figures["static_car_3d_ap"] == pytest.approx(0.5)
+    assert "moving_pedestrian_3d_ap" not in figures  # there is none
+    ignored = Targets(truth, ignored=boxes((3, 3, -1, 0)))
+    metric.reset()
+    metric.update(found, ignored)
+    assert metric.compute()["static_car_3d_ap"] == pytest.approx(0.5)
 
 
 def test_precision_by_motion_needs_motion() -> None:
@@ -153,5 +157,5 @@ def test_precision_by_motion_needs_motion() -> None:
     assert metric.compute()["mean_3d_ap"] == 0
     with pytest.raises(ConfigError, match="what moves"):
         metric.update(Boxes.empty(), Targets(boxes((1, 1, 0, 0)).replace(moving=None)))
-    with pytest.raises(ConfigError, match="moving, static"):
-        MotionAP(Spec(Boxes, classes=("Car",)), motion="parked")
+    with pytest.raises(ConfigError, match="Truck"):
+        MotionAP(Spec(Boxes, classes=("Car",)), iou={"Truck": 0.5})

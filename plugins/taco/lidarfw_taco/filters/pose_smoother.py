@@ -133,7 +133,8 @@ def _shrunk(covariance: Tensor, gain: Tensor) -> Tensor:
 def _rotation(vector: Tensor) -> Tensor:
     """Rotation (3, 3) about a vector (3,) by its length in radians."""
     x, y, z = vector.tolist()
-    return torch.linalg.matrix_exp(vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+    rotation: Tensor = torch.linalg.matrix_exp(vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
+    return rotation
 
 
 def _turn(rotation: Tensor) -> Tensor:

@@ -98,11 +98,11 @@ class CoordinateRegressor(nn.Module):
         """(N, 3) in the frame of the map, or of the region."""
         with torch.autocast(tap.device.type, enabled=False):  # metres in 16 bit are off by half a metre at 100 m
             values = self.last(tap.float())
-            places = self.origin + self.scale * values[:, :3]
+            places: Tensor = self.origin + self.scale * values[:, :3]
             if self.target == "affine":
                 places = places + (values[:, 3:].view(-1, 3, 3) @ source[:, :, None])[:, :, 0]
         around_sensor = self.target == "shift" or (self.target == "affine" and self.regions is not None)
-        return places + source if around_sensor else places
+        return torch.add(places, source) if around_sensor else places
 
     @torch.no_grad()
     def calibrate(self, source: Tensor, batch: Tensor, poses: Poses) -> None:

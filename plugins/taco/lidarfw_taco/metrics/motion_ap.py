@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-from lidarfw.components.metrics.box_ap import BoxAP
+import dataclasses
+
+import torch
+from lidarfw.components.metrics.box_ap import USUAL_IOU, BoxAP
+from lidarfw.components.per_class import per_class
 from lidarfw.errors import ConfigError
 from lidarfw.types import Boxes, Spec, Targets
 
-STATES = {"moving": 1, "static": 0}
+STATES = ("moving", "static")
 
 
 class MotionAP(BoxAP):
-    """`box_ap` of the objects of one motion state: `motion` is moving or static.
+    """`box_ap` of every class twice: of its moving objects and of its static ones.
 
-    The others, and those whose state is not known, are ignored: a detection of them counts neither for nor against.
-    False detections have no motion state and count for both. Keys and other options are those of `box_ap`. Needs boxes
-    that say what moves, as the transform `motion_state` does. For both states at once:
-    `metric={moving_ap: {type: motion_ap, motion: moving}, static_ap: {type: motion_ap, motion: static}}`.
+    Objects of the other state, and those whose state is not known, are ignored: a detection of them counts neither
+    for nor against. False detections have no motion state and count against both. Options and keys are those of
+    `box_ap`, `{state}_{class}_3d_ap` with moving and static. Needs boxes that say what moves, as the transform
+    `motion_state` does; ConfigError without.
     """
 
-    def __init__(
-        self,
-        boxes: Spec,
-        *,
-        motion: str = "moving",
-        iou: dict[str, float] | None = None,
-        default_iou: float = 0.5,
-    ) -> None:
-        super().__init__(boxes, iou=iou, default_iou=default_iou)
-        if motion not in STATES:
-            raise ConfigError(f"metric.motion_ap.motion is {motion!r}; use one of: {', '.join(STATES)}")
-        self.state = STATES[motion]
+    def __init__(self, boxes: Spec, *, iou: dict[str, float] | None = None, default_iou: float = 0.5) -> None:
+        usual = {name: value for name, value in USUAL_IOU.items() if name in boxes.classes}
+        overlaps = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "iou")
+        names = [f"{state} {name}" for state in STATES for name in boxes.classes]
+        both = dict(zip(names, [*overlaps, *overlaps], strict=True))
+        super().__init__(dataclasses.replace(boxes, classes=tuple(names)), iou=both, default_iou=default_iou)
 
     def update(self, boxes: Boxes, targets: Targets) -> None:
         """Count the detections of one frame, or of a batch of frames, in."""
@@ -41,8 +39,14 @@ class MotionAP(BoxAP):
                 "metric.motion_ap needs boxes that say what moves, and the dataset gives none.\n"
                 "  fix: transform=[motion_state,...] works it out from velocities, or from tracks or boxes over time"
             )
-        if truth.moving is not None:
-            others = truth[truth.moving != self.state]
-            ignored = others if targets.ignored is None else Boxes.cat([targets.ignored, others])
-            targets = targets.replace(boxes=truth[truth.moving == self.state], ignored=ignored)
-        super().update(boxes, targets)
+        state = torch.full_like(truth.label, -1) if truth.moving is None else truth.moving
+        moving, static = self._twice(truth)
+        asked = Boxes.cat([moving[state == 1], static[state == 0]])
+        others = [moving[state != 1], static[state != 0]]
+        others += [] if targets.ignored is None else self._twice(targets.ignored)
+        super().update(Boxes.cat(self._twice(boxes)), targets.replace(boxes=asked, ignored=Boxes.cat(others)))
+
+    def _twice(self, boxes: Boxes) -> list[Boxes]:
+        """The boxes as objects of the moving classes, and of the static ones; label -1 stays."""
+        other = torch.where(boxes.label < 0, boxes.label, boxes.label + len(self.classes) // 2)
+        return [boxes, boxes.replace(label=other)]
