@@ -66,7 +66,6 @@ class Regions(nn.Module):
         """Metres (B, K) from poses (B, 4, 4) to the regions, with 1e6 more to those that look another way."""
         regions = self.poses[: max(int(self.founded), 1)]
         matrix = matrix.to(regions.dtype)
-        apart: Tensor = (matrix[:, None, :3, 3] - regions[None, :, :3, 3]).norm(dim=2)
+        apart = (matrix[:, None, :3, 3] - regions[None, :, :3, 3]).norm(dim=2)
         cosine = (torch.einsum("bij,kij->bk", matrix[:, :3, :3], regions[:, :3, :3]) - 1) / 2
-        apart = apart.where(cosine >= TURN, apart + 1e6)
-        return apart
+        return torch.where(cosine >= TURN, apart, apart + 1e6)
