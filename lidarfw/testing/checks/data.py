@@ -124,7 +124,7 @@ class _Prepared(SyntheticDataset):
     """Synthetic frames behind the transforms that the one under test follows."""
 
     def __init__(self, before: Sequence[Transform]) -> None:
-        super().__init__(frames=len(SEEDS), points=4096, sweeps=3 if before else 1)
+        super().__init__(frames=len(SEEDS), points=4096, sweeps=3 if before else 1, image=True)
         self.before = before
         for transform in before:
             self.spec = transform.spec(self.spec)
