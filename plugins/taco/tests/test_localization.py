@@ -401,6 +401,24 @@ def test_mixes_train(overrides: list[str]) -> None:
         assert len(model.eval().predict(batch)) == 2  # type: ignore[attr-defined]
 
 
+def test_a_scan_without_points_beside_another() -> None:
+    """With context and regions: finite in training, and no influence on the other scan afterwards."""
+    frame = SyntheticDataset(frames=1, points=1024)[0]
+    nothing = Points.from_scan(torch.zeros(0, 3), frame.inputs["points"].features[:0])
+    empty = Frame({"points": nothing}, frame.targets, frame.meta)
+    batch = collate([empty, frame])
+    overrides = model_overrides("head.scene_coord.regions=4", "dataset.synthetic.points=1024")
+    terms, model = learned(batch, overrides, 2, 1e-3)
+    assert float(terms["scene_coord"]["region"].detach()) >= 0
+    assert all(value.isfinite() for values in terms.values() for value in values.values())
+    learned(collate([empty]), overrides, 2, 1e-3)
+    with torch.no_grad():
+        model.eval()  # type: ignore[attr-defined]
+        both, alone = model.predict(batch), model.predict(collate([frame]))  # type: ignore[attr-defined]
+    assert not bool(both[0].of(Poses).ok)
+    torch.testing.assert_close(both[1].of(Poses).matrix, alone[0].of(Poses).matrix, atol=1e-3, rtol=1e-3)
+
+
 def test_small_backbone_takes_a_scan_all_around() -> None:
     assert math.isclose(compose(["backbone=taco_small"]).backbone.taco.upper[0], 38.4)
     assert DataSpec().sweeps == 1
