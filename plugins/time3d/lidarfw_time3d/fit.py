@@ -1,7 +1,8 @@
 """Learn the confidence of the tracker `kalman_confidence` from detections and labels of KITTI tracking.
 
     python -m lidarfw_time3d.fit DETECTIONS --labels label_02 --calib calib --poses poses -o weights.json
-    python -m lidarfw_time3d.fit ... --folds 5      # cross-validated by sequence instead: what it brings
+    python -m lidarfw_time3d.fit ... --folds 5           # cross-validated by sequence instead: what it brings
+    python -m lidarfw_time3d.fit ... --folds 5 --parts   # and what every part of the tracker brings
 
 The tracker runs over every sequence; each box of each track, detected or coasted, becomes a sample: its features,
 and whether it is right (3D IoU of at least 0.25 with an object that no better box has). Boxes on ignored objects, and
@@ -15,8 +16,8 @@ import argparse
 import itertools
 import json
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -247,23 +248,75 @@ def make_tracker(
     return KalmanConfidence(Spec(Boxes, classes=tuple(classes)), **chosen)
 
 
+@dataclass(frozen=True)
+class Variant:
+    """A tracker to compare: with other options, without poses, or with a rule in place of the learned confidence."""
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    posed: bool = True
+    rule: bool = False
+
+
+VARIANTS = {
+    "all parts": Variant(),
+    "without coasted boxes": Variant({"min_unseen": 2.0}),
+    "without poses": Variant(posed=False),
+    "without features of place": Variant({"place_features": False}),
+    "a rule instead of the confidence": Variant(rule=True),
+    "a rule, without coasted boxes": Variant({"min_unseen": 2.0}, rule=True),
+    "a rule, without poses": Variant(posed=False, rule=True),
+}
+
+
+class HitRule:
+    """What trackers usually do: a track is shown from three hits on and for two frames unseen, with its mean score."""
+
+    _MEAN, _HITS, _MISSED, _BEGIN = (FEATURES.index(name) for name in ("mean", "hits", "missed", "begin"))
+
+    def probability(self, values: Array, label: Array, classes: Sequence[str]) -> Array:
+        """(T,) as of `confidence.Confidence`."""
+        hits, missed = np.exp(values[:, self._HITS]), np.expm1(values[:, self._MISSED])
+        enough = hits > np.minimum(5 * values[:, self._BEGIN], 2) + 0.5  # fewer in the first frames of a sequence
+        shown: Array = (enough & (missed < 2.5)) / (1 + np.exp(-values[:, self._MEAN]))
+        return shown
+
+
 def cross_validate(
-    data: Sequence[Labelled], classes: Sequence[str], view: float, folds: int, **options: Any
-) -> dict[str, dict[str, float]]:
-    """Figures by rules ("devkit", "clean") on all sequences, each tracked with weights that have not seen it."""
-    metrics = {rules: Mot3D(Spec(Tracks, classes=tuple(classes)), default_iou=IOU, rules=rules)
-               for rules in ("devkit", "clean")}  # fmt: skip
+    data: Sequence[Labelled], classes: Sequence[str], view: float, folds: int, variants: Mapping[str, Variant]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Figures by variant and rules ("devkit", "clean") on all sequences.
+
+    Every sequence is tracked with calibration and weights that have not seen it.
+    """
+    made = {name: {rules: Mot3D(Spec(Tracks, classes=tuple(classes)), default_iou=IOU, rules=rules)
+                   for rules in ("devkit", "clean")} for name in variants}  # fmt: skip
+    unposed = [_without_poses(entry) for entry in data]
+    for number in progress(range(folds), "folds"):
+        for posed in sorted({variant.posed for variant in variants.values()}):
+            entries = data if posed else unposed
+            learnt = fit([entry for place, entry in enumerate(entries) if place % folds != number], classes, view)
+            for name, variant in variants.items():
+                if variant.posed == posed:
+                    tracker = _tracker_of(variant, learnt, classes, view)
+                    for entry in entries[number::folds]:
+                        _count(entry, tracker, made[name])
+    return {name: {rules: {key: float(value) for key, value in metric.compute().items()}
+                   for rules, metric in metrics.items()} for name, metrics in made.items()}  # fmt: skip
+
+
+def _without_poses(entry: Labelled) -> Labelled:
+    frames = [replace(frame, pose=None) for frame in entry.sequence.frames]
+    return Labelled(replace(entry.sequence, frames=frames), entry.targets)
+
+
+def _tracker_of(variant: Variant, learnt: dict[str, Any], classes: Sequence[str], view: float) -> KalmanConfidence:
     with tempfile.TemporaryDirectory() as folder:
-        for number in progress(range(folds), "folds"):
-            learnt = fit(
-                [entry for place, entry in enumerate(data) if place % folds != number], classes, view, **options
-            )
-            path = Path(folder) / f"{number}.json"
-            write_text(path, json.dumps(learnt))
-            tracker = make_tracker(classes, view, learnt["calibration"], weights=str(path), **options)
-            for entry in data[number::folds]:
-                _count(entry, tracker, metrics)
-    return {rules: {key: float(value) for key, value in metric.compute().items()} for rules, metric in metrics.items()}
+        path = Path(folder) / "weights.json"
+        write_text(path, json.dumps(learnt))
+        tracker = make_tracker(classes, view, learnt["calibration"], weights=str(path), **variant.options)
+    if variant.rule:
+        tracker.confidence = HitRule()  # type: ignore[assignment]
+    return tracker
 
 
 def _count(entry: Labelled, tracker: KalmanConfidence, metrics: dict[str, Mot3D]) -> None:
@@ -284,6 +337,7 @@ def main() -> None:
     parser.add_argument("--poses", type=Path, help="3 x 4 poses of camera 0")
     parser.add_argument("--view", type=float, default=1.4, help="field of view, radians (%(default)s)")
     parser.add_argument("--folds", type=int, default=0, help="cross-validate by sequence, and write nothing")
+    parser.add_argument("--parts", action="store_true", help="with --folds: also without each part of the tracker")
     parser.add_argument(
         "--option", nargs="+", default=[], metavar="NAME=NUMBER", help="of the tracker: min_unseen=2 (nothing coasted)"
     )
@@ -294,11 +348,12 @@ def main() -> None:
     classes = detections.kitti_classes(arguments.detections)
     data = read(arguments.detections, arguments.labels, arguments.calib, arguments.poses, classes)
     if arguments.folds:
-        found = cross_validate(data, classes, arguments.view, arguments.folds, **options)
-        for rules, figures in found.items():
-            for name in classes:
-                shown = {key: figures.get(f"{name.lower()}_{key}", float("nan")) for key in ("samota", "mota", "ids")}
-                print(rules, name, " ".join(f"{key} {value:.4f}" for key, value in shown.items()))
+        variants = VARIANTS if arguments.parts else {"cross-validated": Variant(options)}
+        found = cross_validate(data, classes, arguments.view, arguments.folds, variants)
+        for variant, (rules, kind) in itertools.product(found, itertools.product(("devkit", "clean"), classes)):
+            figures = found[variant][rules]
+            shown = {key: figures.get(f"{kind.lower()}_{key}", float("nan")) for key in ("samota", "mota", "ids")}
+            print(f"{variant}: {rules} {kind}", " ".join(f"{key} {value:.4f}" for key, value in shown.items()))
         return
     learnt = fit(data, classes, arguments.view, **options)
     write_text(arguments.output, json.dumps(learnt))

@@ -10,7 +10,7 @@ import pytest
 from lidarfw.files import write_text
 
 from lidarfw_time3d import fit
-from lidarfw_time3d.confidence import Confidence
+from lidarfw_time3d.confidence import FEATURES, Confidence
 
 CALIBRATION = """P0: 700 0 600 0 0 700 180 0 0 0 1 0
 P2: 700 0 600 45 0 700 180 0.2 0 0 1 0.003
@@ -76,7 +76,23 @@ def test_what_is_learnt_tells_cars_from_clutter(drives: Path, monkeypatch: pytes
 def test_cross_validation_tracks_what_was_not_learnt_from(drives: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fit, "_STEPS", 40)
     monkeypatch.setattr(fit, "_BATCH", 256)
-    figures = fit.cross_validate(_read(drives), ("Car",), 1.6, folds=2)
-    assert set(figures) == {"devkit", "clean"}
-    assert figures["clean"]["car_samota"] > 0.9
-    assert figures["clean"]["car_ids"] == 0
+    variants = {
+        "all": fit.Variant(),
+        "rule": fit.Variant(rule=True),
+        "blind": fit.Variant({"min_unseen": 2.0}, posed=False),
+    }
+    found = fit.cross_validate(_read(drives), ("Car",), 1.6, 2, variants)
+    assert set(found) == set(variants)
+    assert set(found["all"]) == {"devkit", "clean"}
+    for name in variants:
+        assert found[name]["clean"]["car_samota"] > 0.9
+        assert found[name]["clean"]["car_ids"] == 0
+
+
+def test_the_rule_shows_what_was_hit_three_times() -> None:
+    values = np.zeros((5, len(FEATURES)))
+    rows = {"hits": np.log([1, 2, 3, 3, 1]), "missed": np.log1p([0, 0, 0, 3, 0]), "begin": [2, 2, 2, 2, 0]}
+    for name, column in rows.items():
+        values[:, FEATURES.index(name)] = column
+    chance = fit.HitRule().probability(values, np.zeros(5), ("Car",))
+    assert chance.tolist() == [0, 0, 0.5, 0, 0.5]  # the last one is in the first frame of a sequence
