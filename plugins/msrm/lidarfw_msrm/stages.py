@@ -15,6 +15,7 @@ import argparse
 import copy
 import itertools
 import json
+import math
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -149,9 +150,14 @@ def differences(found: dict[str, dict[str, float]], drawn: dict[str, list[dict[s
     for name, other in pairs:
         cells = []
         for key in COMPARED:
-            apart = [one[key] - two[key] for one, two in zip(drawn[name], drawn[other], strict=True)]
+            apart = [
+                one.get(key, math.nan) - two.get(key, math.nan)
+                for one, two in zip(drawn[name], drawn[other], strict=True)
+            ]
             low, high = interval(apart)
-            cells.append(f"{found[name][key] - found[other][key]:+.3f} [{low:+.3f}, {high:+.3f}]")
+            cells.append(
+                f"{found[name].get(key, math.nan) - found[other].get(key, math.nan):+.3f} [{low:+.3f}, {high:+.3f}]"
+            )
         lines.append(f"| {name} - {other} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -163,7 +169,7 @@ def table(found: dict[str, dict[str, float]], classes: Sequence[str]) -> str:
     lines = ["| | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
     for name, one in found.items():
         cells = [one[f"{prefix}{k}_3d_ap"] for prefix in ("", "loose_") for k in keys]
-        cells += [one[f"match_mean_{what}"] for what in ("iou", "center", "yaw", "recall")]
+        cells += [one.get(f"match_mean_{what}", math.nan) for what in ("iou", "center", "yaw", "recall")]
         lines.append(f"| {name} | " + " | ".join(f"{cell:.3f}" for cell in cells) + " |")
     return "\n".join(lines)
 

@@ -19,7 +19,6 @@ from torch import Tensor
 
 BINS: dict[str, tuple[float, float]] = {"near": (0, 20), "middle": (20, 40), "far": (40, math.inf)}  # metres
 VISIBILITY = {"visible": 0, "partly": 1, "largely": 2}  # occlusion as labelled
-QUALITIES = ("iou", "center", "yaw", "recall")
 LABEL, SCORE, VERDICT, RANGE, OCCLUSION, MATCHED, IOU, CENTER, YAW = range(9)  # columns of a detection
 
 
@@ -29,7 +28,7 @@ class BoxQuality(Metric):
     By falling score each detection takes the free object of its class with the highest 3D IoU of at least `matched`;
     of these pairs are `{class}_iou`, the mean IoU, `{class}_center`, metres between the centres, `{class}_yaw`,
     radians between the axes (a box may point either way), and `{class}_recall`, the share of objects in a pair. The
-    mean over classes is called `mean_...`.
+    mean over classes is called `mean_...`. Where nothing matches there is no such figure, but `mean_iou` is 0.
 
     `{class}_ap_{bin}` is the average precision of `box_ap` at the IoU of `iou` (Car 0.7, Pedestrian and Cyclist 0.5
     where not given), `{class}_iou_{bin}` the mean IoU, of the objects of a bin: near (up to 20 m), middle (to 40 m),
@@ -87,7 +86,7 @@ class BoxQuality(Metric):
             torch.cat(state) if isinstance(state, list) else state for state in (self.detections, self.objects)
         )
         figures: dict[str, float] = {}
-        means: dict[str, list[float]] = {name: [] for name in QUALITIES}
+        means: dict[str, list[float]] = {}
         for label, name in enumerate(self.classes):
             mine, there = rows[rows[:, LABEL] == label], objects[objects[:, 0] == label]
             if len(there) == 0:
@@ -96,9 +95,10 @@ class BoxQuality(Metric):
             whole = _quality(mine, len(there))
             figures |= {f"{key}_{what}": value for what, value in (whole | _by_bin(mine, there)).items()}
             for what, value in whole.items():
-                means[what].append(value)
-        known = {what: [v for v in values if not math.isnan(v)] for what, values in means.items()}
-        return figures | {f"mean_{what}": sum(v) / len(v) if v else math.nan for what, v in known.items()}
+                means.setdefault(what, []).append(value)
+        return (
+            {"mean_iou": 0.0, "mean_recall": 0.0} | figures | {f"mean_{w}": sum(v) / len(v) for w, v in means.items()}
+        )
 
 
 def _overlap(boxes: Boxes, truth: Boxes, ignored: Boxes) -> tuple[Tensor, Tensor]:
@@ -149,9 +149,11 @@ def _occlusion(truth: Boxes) -> Tensor:
 
 def _quality(rows: Tensor, objects: int) -> dict[str, float]:
     pairs = rows[rows[:, MATCHED] == 1]
-    mean = pairs.mean(0) if len(pairs) else pairs.new_full((9,), math.nan)
-    values = (float(mean[IOU]), float(mean[CENTER]), float(mean[YAW]), len(pairs) / objects)
-    return dict(zip(QUALITIES, values, strict=True))
+    found = {"recall": len(pairs) / objects}
+    if len(pairs):
+        mean = pairs.mean(0)
+        found |= {"iou": float(mean[IOU]), "center": float(mean[CENTER]), "yaw": float(mean[YAW])}
+    return found
 
 
 def _by_bin(rows: Tensor, objects: Tensor) -> dict[str, float]:
