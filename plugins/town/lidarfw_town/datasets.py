@@ -22,7 +22,7 @@ from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.errors import DataError
 from lidarfw.interfaces.data import Dataset
 from lidarfw.nuscenes import CLASSES
-from lidarfw.types import Camera, DataSpec, Frame, Image, Spec
+from lidarfw.types import Camera, DataSpec, Frame, Image, Spec, Tracks
 
 from lidarfw_town.version import VERSION
 
@@ -253,6 +253,8 @@ class TownOxford(TownDrives, OxfordDataset):
             weather=weather,
         )  # fmt: skip
         super().__init__(root=root, split=split, boxes=boxes, classes=classes, sweeps=sweeps, pose=pose)
+        if boxes:  # every object of the town has an identity
+            self.spec = replace(self.spec, targets=self.spec.targets | {Tracks})
 
 
 class Town360(TownDrives, Kitti360Dataset):
