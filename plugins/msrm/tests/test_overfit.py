@@ -17,7 +17,7 @@ GRID = Grid((0.0, -40.0, -3.0), (70.4, 40.0, 1.0), (3.2, 3.2, 4.0))
 
 def scans() -> tuple[Batch, Dataset]:
     """Four scans as a batch."""
-    data = SyntheticDataset(frames=4, sequence_length=1, points=4096)
+    data = SyntheticDataset(frames=4, sequence_length=1, points=2048)
     return collate([data[number] for number in range(4)]), data
 
 
@@ -50,11 +50,11 @@ def test_four_scans_by_heart() -> None:
     assert truth is not None
     assert isinstance(points, Points)
     truth = truth.replace(occlusion=None)
-    proposals, targets = moved(truth, 4), Targets(boxes=truth)
+    proposals, targets = moved(truth, 3), Targets(boxes=truth)
     bev = BEV(torch.zeros(4, 4, *GRID.shape(1)[1:]), GRID)
     net = MSRMHead(
         Spec(Boxes, classes=data.spec.classes), Spec(BEV, 4, 1, GRID), None, data.spec.inputs["points"], data.spec,
-        pool="points", regions=32, grid=2, neighbors=6, channels=64, heads=2, dropout=0.0,
+        pool="points", regions=16, grid=2, neighbors=4, channels=64, heads=2, dropout=0.0,
     )  # fmt: skip
     loss = MSRMLoss(Spec(Boxes))
     optimizer = torch.optim.Adam(net.parameters())
