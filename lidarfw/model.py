@@ -51,7 +51,7 @@ class PerceptionModel(nn.Module):
         """Predictions that a tracker trains on, still in the graph: its losses reach the head that made them."""
         heads = {ref.producer for refs in step.takes.values() for ref in refs if ref.item == "value"}
         heads = {head for head in heads if head.startswith("head.")}
-        return {f"{head}.decoded": self.get_submodule(head).decode(outputs[head]) for head in heads}
+        return {f"{head}.decoded": self._decode(head, outputs) for head in heads}
 
     def losses(self, outputs: dict[str, Any], batch: Batch, progress: float = 1.0) -> dict[str, dict[str, Tensor]]:
         """Weighted terms of every loss: name -> term -> scalar. `progress` is the share of training done, for ramps."""
@@ -152,9 +152,13 @@ class PerceptionModel(nn.Module):
         """The prediction of a head, decoded once per batch; cut from the graph, but for trackers (`_attached`)."""
         key = f"{head}.decoded"
         if key not in outputs:
-            decoded: Record = self.get_submodule(head).decode(outputs[head])
-            outputs[key] = decoded.detach()
+            outputs[key] = self._decode(head, outputs).detach()
         return outputs[key]
+
+    def _decode(self, head: str, outputs: dict[str, Any]) -> Record:
+        part: Any = self.get_submodule(head)
+        decoded: Record = part.decode(outputs[head])
+        return decoded
 
     # streams
 

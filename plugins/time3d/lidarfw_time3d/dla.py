@@ -53,6 +53,8 @@ class Tree(nn.Module):
         joined = (joined or 2 * out_channels) + (channels if keep_input else 0)
         self.keep_input, self.depth = keep_input, depth
         self.shrink: nn.Module = nn.MaxPool2d(stride, ceil_mode=True) if stride > 1 else nn.Identity()
+        self.first: nn.Module
+        self.second: nn.Module
         if depth == 1:
             self.first, self.second = Block(channels, out_channels, stride), Block(out_channels, out_channels)
             self.root = Root(joined, out_channels)
@@ -157,6 +159,7 @@ class DLA(Backbone):
             maps.append(features)
         finest = [maps[3]]
         for merges, start in zip(self.up, (2, 1, 0), strict=True):
+            assert isinstance(merges, nn.ModuleList)
             for place, merge in enumerate(merges, start + 1):
                 maps[place] = merge(maps[place], maps[place - 1])
             finest.append(maps[3])

@@ -75,16 +75,7 @@ class CueEmbedding(nn.Module):
     ) -> None:
         super().__init__()
         self.cues = tuple(cue for cue in CUES if cue in cues and (cue != "appearance" or appearance))
-        places = 3 + 6 * len(_WAVES)
-        makers = {
-            "box3d": lambda: mlp((places + 4, 64, _SHAPE, _SHAPE)) if geometry == "raw"
-            else CornerEmbedding(8, places, geometry == "ordered"),
-            "box2d": lambda: mlp((4, 64, _SHAPE, _SHAPE)) if geometry == "raw"
-            else CornerEmbedding(4, 2, geometry == "ordered"),
-            "appearance": lambda: nn.Sequential(nn.LayerNorm(appearance), nn.Linear(appearance, _SHAPE)),
-            "category": lambda: nn.Linear(classes, _CATEGORY),
-        }  # fmt: skip
-        self.embed = nn.ModuleDict({cue: makers[cue]() for cue in self.cues})
+        self.embed = nn.ModuleDict({cue: _embedding(cue, classes, appearance, geometry) for cue in self.cues})
         self.absent = nn.ParameterDict({c: nn.Parameter(torch.zeros(_SHAPE)) for c in self.cues if c in _OPTIONAL})
         inputs = sum(_CATEGORY if cue == "category" else _SHAPE for cue in self.cues) + 1
         self.join = nn.Sequential(
@@ -127,6 +118,18 @@ class CueEmbedding(nn.Module):
         if self.training:
             there = there & (torch.rand(len(there), device=cue.device) >= self.dropout)
         return torch.where(there[:, None, None], cue, self.absent[name])
+
+
+def _embedding(cue: str, classes: int, appearance: int, geometry: str) -> nn.Module:
+    """The network of one cue."""
+    if cue == "category":
+        return nn.Linear(classes, _CATEGORY)
+    if cue == "appearance":
+        return nn.Sequential(nn.LayerNorm(appearance), nn.Linear(appearance, _SHAPE))
+    corners, numbers = (8, 3 + 6 * len(_WAVES)) if cue == "box3d" else (4, 2)
+    if geometry == "raw":
+        return mlp((numbers + 4 if cue == "box3d" else 4, 64, _SHAPE, _SHAPE))
+    return CornerEmbedding(corners, numbers, geometry == "ordered")
 
 
 def waves(places: Tensor) -> Tensor:

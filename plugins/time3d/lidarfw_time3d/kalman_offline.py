@@ -56,7 +56,7 @@ class KalmanOffline(KalmanConfidence):
         state.moments.append(Moment(online.id.copy(), known, missed, online.pose.copy(), passed))
         return []
 
-    def flush(self, state: KalmanOfflineState) -> list[FrameResult]:  # type: ignore[override]
+    def flush(self, state: KalmanOfflineState) -> list[FrameResult]:
         """All frames, smoothed."""
         smoothed = smooth(state.moments, self.frame_time)
         return [

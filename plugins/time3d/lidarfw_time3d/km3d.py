@@ -59,7 +59,7 @@ class Found:
     @property
     def keypoints(self) -> Tensor:
         """(N, 9, 2) pixels."""
-        return (self.values[:, KEYPOINTS].unflatten(1, (9, 2)) + self.cell[:, None]) * self.stride
+        return (self.values[:, KEYPOINTS].reshape(-1, 9, 2) + self.cell[:, None]) * self.stride
 
     @property
     def size(self) -> Tensor:
@@ -74,7 +74,7 @@ class Found:
 
     def yaw(self, pixel: Tensor) -> Tensor:
         """(N,) headings of boxes whose centre is seen at a pixel (N, 2): of the bin that is more sure to be in."""
-        bins = self.values[:, TURN].unflatten(1, (2, 4))
+        bins = self.values[:, TURN].reshape(-1, 2, 4)
         sure = bins[:, :, 1] - bins[:, :, 0]
         chosen = bins[torch.arange(len(bins), device=bins.device), sure.argmax(1)]
         middle = bins.new_tensor(BINS)[sure.argmax(1)]

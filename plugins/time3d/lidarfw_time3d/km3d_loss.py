@@ -129,7 +129,7 @@ def _ignored(output: KM3DOutput, ignored: Boxes) -> Tensor:
     rectangle = rectangles(ignored.tensor.nan_to_num(), output.lens(ignored.batch))
     if ignored.box2d is not None:  # regions without a box in space
         rectangle = torch.where(whole[:, None], rectangle, ignored.box2d.to(rectangle))
-    low, high = (rectangle / output.stride).unflatten(1, (2, 2)).unbind(1)
+    low, high = (rectangle / output.stride).reshape(-1, 2, 2).unbind(1)
     height, width = output.heatmap.shape[2:]
     x, y = (torch.arange(n, device=low.device) for n in (width, height))
     across, along = (x >= low[:, :1].floor()) & (x <= high[:, :1]), (y >= low[:, 1:].floor()) & (y <= high[:, 1:])
@@ -156,7 +156,7 @@ def shape_terms(found: Found, boxes: Boxes, rectangle: Tensor) -> dict[str, Tens
     pixel = found.lens.pixels(points) / found.stride - found.cell[:, None]
     known = known_keypoints(found, boxes)[..., None].expand(-1, -1, 2)
     weight = depth_weight(points[:, 8, 2])[:, None, None]
-    missed = (found.values[:, KEYPOINTS].unflatten(1, (9, 2)) - pixel).abs() * weight
+    missed = (found.values[:, KEYPOINTS].reshape(-1, 9, 2) - pixel).abs() * weight
     middle = (rectangle[:, :2] + rectangle[:, 2:]) / 2 / found.stride - found.cell
     extent = (rectangle[:, 2:] - rectangle[:, :2]) / found.stride
     return {
@@ -180,7 +180,7 @@ def angles(found: Found, boxes: Boxes) -> Tensor:
 
 def turn_loss(values: Tensor, angle: Tensor) -> Tensor:
     """Two bins (N, 8) against observation angles (N,): whether in each, and sine and cosine from the middle if so."""
-    bins = values.unflatten(1, (2, 4)).float()
+    bins = values.reshape(-1, 2, 4).float()
     away = wrapped(angle[:, None] - angle.new_tensor(BINS)).float()
     inside = away.abs() < math.pi / 2 + _WITHIN
     sort = nn.functional.cross_entropy(bins[..., :2].flatten(0, 1), inside.long().flatten())

@@ -161,9 +161,11 @@ class TemporalConsistencyLoss(Loss):
 
 def _attribute_loss(logits: Tensor, objects: Boxes) -> Tensor:
     """Cross-entropy of logits (N, 3), 0 where nothing is said of what the objects do."""
-    if objects.attribute is None and objects.moving is None:
+    known = objects.attribute
+    if known is None and objects.moving is not None:
+        known = _states(objects.moving)
+    if known is None:
         return 0 * logits.sum()
-    known = objects.attribute if objects.attribute is not None else _states(objects.moving)
     said = known >= 0
     return nn.functional.cross_entropy(logits, known.clamp(min=0), reduction="none")[said].sum() / said.sum().clamp(
         min=1

@@ -96,14 +96,16 @@ class SimulatedDetector(Transform):
         ahead = place / np.maximum(np.linalg.norm(place, axis=1, keepdims=True), 1e-6)
         aside = np.stack([-ahead[:, 1], ahead[:, 0]], 1)
         along, across = rng.normal(size=(2, len(place), 1)) * np.linalg.norm(place, axis=1)[None, :, None]
-        flat: Array = self.noise.flat * rng.normal(size=place.shape)
-        return flat + self.noise.along * along * ahead + self.noise.across * across * aside
+        error: Array = self.noise.flat * rng.normal(size=place.shape)
+        error += self.noise.along * along * ahead + self.noise.across * across * aside
+        return error
 
     def _typical(self, place: Array) -> Array:
         """Length (N,) that errors at (N, 2) usually have."""
         far = np.linalg.norm(place, axis=1)
         typical: Array = np.sqrt(2 * self.noise.flat**2 + far**2 * (self.noise.along**2 + self.noise.across**2))
-        return np.maximum(typical, 1e-6)
+        at_least: Array = np.maximum(typical, 1e-6)
+        return at_least
 
     def _false(self, tracks: Tracks, rng: np.random.Generator) -> Boxes:
         count, known = int(rng.poisson(_FALSE)), tracks.boxes

@@ -190,8 +190,8 @@ class Time3D(Tracker):
         before = self._flow(boxes, past, poses, frames[:, 1])
         # each frame once as "now", then by pair
         current = self._flow(boxes, rows, poses, torch.arange(count, device=poses.device))[frames[:, 1]]
-        told = self.temporal(before, current, past >= 0, now >= 0, seconds)
-        return Time3DOutput(*told, past, now, frames, seconds, boxes, poses)
+        logits, velocity, change, state = self.temporal(before, current, past >= 0, now >= 0, seconds)
+        return Time3DOutput(logits, velocity, change, state, past, now, frames, seconds, boxes, poses)
 
     def _flow(self, boxes: Boxes, rows: Tensor, poses: Tensor, goal: Tensor) -> Tensor:
         """F^ (P, K, d) of boxes at rows (P, K), seen from the sensor at frames `goal` (P,)."""
