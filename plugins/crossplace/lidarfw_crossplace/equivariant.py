@@ -31,7 +31,7 @@ def turned_cells(turns: int) -> Tensor:
 
 
 class GroupConv2d(nn.Module):
-    """3 x 3 convolution with every filter in `turns` orientations (4 or 8), and padding 1.
+    """Convolution of size 3 (padded by 1) or 1 with every filter in `turns` orientations, 4 or 8.
 
     Channels of the input are C filters by T orientations, (B, C * T, H, W); a plain picture, which has none, by
     `lifting`. Input and output turn together: turning the picture by 1 / T moves all orientations on by one.
@@ -41,26 +41,27 @@ class GroupConv2d(nn.Module):
     order: Tensor
 
     def __init__(
-        self, in_channels: int, out_channels: int, turns: int, *, stride: int = 1, lifting: bool = False
+        self, in_channels: int, out_channels: int, turns: int, *, size: int = 3, stride: int = 1, lifting: bool = False
     ) -> None:
         super().__init__()
-        self.turns, self.stride, self.lifting = turns, stride, lifting
+        self.turns, self.size, self.stride, self.lifting = turns, size, stride, lifting
         seen = 1 if lifting else turns
-        self.weight = nn.Parameter(torch.empty(out_channels, in_channels, seen, 9))
-        nn.init.normal_(self.weight, std=math.sqrt(2 / (in_channels * seen * 9)))
-        self.register_buffer("cells", turned_cells(turns), persistent=False)
+        self.weight = nn.Parameter(torch.empty(out_channels, in_channels, seen, size**2))
+        nn.init.normal_(self.weight, std=math.sqrt(2 / (in_channels * seen * size**2)))
+        cells = turned_cells(turns) if size == 3 else torch.zeros(turns, 1, dtype=torch.long)
+        self.register_buffer("cells", cells, persistent=False)
         steps = torch.arange(turns)
         self.register_buffer("order", (steps - steps[:, None]) % turns, persistent=False)
 
     def filters(self) -> Tensor:
-        """(out * T, in * T, 3, 3): every filter in every orientation."""
+        """(out * T, in * T, size, size): every filter in every orientation."""
         turned = [self.weight if self.lifting else self.weight[:, :, order] for order in self.order]
         kernel = torch.stack([part[..., cells] for part, cells in zip(turned, self.cells, strict=True)], 1)
-        return kernel.reshape(kernel.shape[0] * self.turns, -1, 3, 3)
+        return kernel.reshape(kernel.shape[0] * self.turns, -1, self.size, self.size)
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C * T, H, W), or (B, C, H, W) for `lifting` -> (B, out * T, H', W')."""
-        return F.conv2d(features, self.filters(), stride=self.stride, padding=1)
+        return F.conv2d(features, self.filters(), stride=self.stride, padding=self.size // 2)
 
 
 class GroupNorm3d(nn.BatchNorm3d):
@@ -83,7 +84,7 @@ class GroupBlock(nn.Module):
         )  # fmt: skip
         self.shortcut: nn.Module = nn.Identity()
         if in_channels != channels:
-            self.shortcut = nn.Sequential(GroupConv2d(in_channels, channels, turns), GroupNorm3d(channels))
+            self.shortcut = nn.Sequential(GroupConv2d(in_channels, channels, turns, size=1), GroupNorm3d(channels))
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, C * T, H, W) -> (B, channels * T, H, W)."""
@@ -107,7 +108,7 @@ class EquivariantBEVBackbone(Backbone):
         *,
         turns: int = 8,
         channels: tuple[int, ...] = (4, 8, 16),
-        halve: tuple[bool, ...] = (True, False, True),
+        halve: tuple[bool, ...] = (True, True, False),
     ) -> None:
         """Options: turns, orientations of each filter, 4 or 8. channels: filters of each stage; halve: before it."""
         super().__init__()
@@ -115,7 +116,7 @@ class EquivariantBEVBackbone(Backbone):
             raise ConfigError(
                 "equivariant_bev: turns are 4 or 8, and channels and halve need a value for each stage\n"
                 f"  given: turns: {turns}, channels: {list(channels)}, halve: {list(halve)}\n"
-                "  fix: for example turns: 8, channels: [4, 8, 16], halve: [true, false, true]"
+                "  fix: for example turns: 8, channels: [4, 8, 16], halve: [true, true, false]"
             )
         self.turns = turns
         first = GroupConv2d(bev.channels, channels[0], turns, stride=2, lifting=True)

@@ -78,56 +78,61 @@ class PlaceHead(Head):
 
 
 class PlaceBEVHead(Head):
-    """The head of CosPlace on a bird's-eye view with the sensor in the middle, blind to the heading.
+    """A descriptor of a bird's-eye view with the sensor in the middle, that does not see the heading.
 
-    The generalised mean is taken over each of `rings` rings round the middle of the grid, so turning the map leaves it
-    as it is, and the distance of things stays known. Cells farther out than the nearest border are left out.
+    The map is read in polar coordinates, `rings` by `angles`. Turning the vehicle moves every ring round, which the
+    magnitudes of its Fourier transform do not see, while they still tell how things are arranged round the sensor:
+    the mean over a ring, its frequency 0, forgets that. The lowest `frequencies` of every ring and channel go through
+    a linear layer to unit length. Xu et al., "DiSCO: Differentiable Scan Context with Orientation", RA-L 2021.
     """
 
+    grid: Tensor
     defaults = {"loss": ["tsap"], "metric": ["recall_at"]}
-    example: ClassVar[dict[str, Any]] = {"rings": 2}
+    example: ClassVar[dict[str, Any]] = {"rings": 2, "angles": 8, "frequencies": 3}
 
-    def __init__(self, bev: Spec, *, channels: int = 256, rings: int = 8) -> None:
-        """Options: channels, the length D of the descriptor; rings."""
+    def __init__(
+        self, bev: Spec, *, channels: int = 256, rings: int = 8, angles: int = 32, frequencies: int = 9
+    ) -> None:
+        """Options: channels, the length D of the descriptor; rings; angles of a ring; frequencies that are kept."""
         super().__init__()
-        self.pool = GeM()
-        self.linear = nn.Linear(bev.channels * _positive(rings), _positive(channels))
-        self.register_buffer("ring", _ring_weights(bev, rings), persistent=False)
+        if frequencies > _positive(angles) // 2 + 1:
+            raise ConfigError(f"head.place_bev: {angles} angles have {angles // 2 + 1} frequencies, not {frequencies}")
+        self.frequencies = _positive(frequencies)
+        self.linear = nn.Linear(bev.channels * _positive(rings) * frequencies, _positive(channels))
+        self.register_buffer("grid", _polar_grid(bev, rings, angles), persistent=False)
         self.provides = Spec(Descriptors, channels)
 
     def forward(self, bev: BEV, meta: list[FrameMeta]) -> PlaceOutput:
         """Feature maps (B, F, h, w) -> descriptors (B, D)."""
-        powers = unit(bev.features).flatten(2).clamp(min=1e-6).pow(self.pool.power)
-        pooled = (powers @ self.ring.T).pow(1 / self.pool.power)  # type: ignore[operator]  # (B, F, rings)
-        return PlaceOutput(unit(self.linear(pooled.flatten(1))), _modalities(meta))
+        places = self.grid.to(bev.features).expand(bev.batch_size, -1, -1, -1)
+        polar = F.grid_sample(unit(bev.features), places, align_corners=True)  # (B, F, rings, angles)
+        spectrum = torch.fft.rfft(polar.float(), norm="forward")[..., : self.frequencies]
+        magnitude = (spectrum.real.square() + spectrum.imag.square() + 1e-8).sqrt()  # finite gradient also at 0
+        amplitude = torch.cat([magnitude[..., :1], 2 * magnitude[..., 1:]], 3)  # of the mean and of the cosines
+        return PlaceOutput(unit(self.linear(amplitude.flatten(1))), _modalities(meta))
 
     def decode(self, output: PlaceOutput) -> Descriptors:
         """The descriptors."""
         return Descriptors(output.vector, output.modality)
 
 
-def _ring_weights(bev: Spec, rings: int) -> Tensor:
-    """(rings, h * w): how much each cell counts in the mean of each ring; every row adds up to 1.
+def _polar_grid(bev: Spec, rings: int, angles: int) -> Tensor:
+    """(1, rings, angles, 2) where to read the map, as grid_sample wants it: column and row, -1..1.
 
-    A cell belongs to its two nearest rings in proportion, so that nothing jumps when a map is turned.
+    The sensor is in the middle of the map's cells, which may reach a little beyond the grid: padding puts as much on
+    either side. The rings end at the nearest border.
     """
-    centers = bev.grid.bev_centers(bev.stride)
-    middle = [(low + high) / 2 for low, high in zip(bev.grid.lower[:2], bev.grid.upper[:2], strict=True)]
-    reach = min((high - low) / 2 for low, high in zip(bev.grid.lower[:2], bev.grid.upper[:2], strict=True))
-    radius = (centers - centers.new_tensor(middle)).norm(dim=2).flatten() / reach
-    place = radius * rings - 0.5  # the middle of ring i lies at i
-    weights = (1 - (place - torch.arange(rings)[:, None]).abs()).clamp(min=0)
-    weights[0] = torch.where(place < 0, 1.0, weights[0])
-    weights = torch.where(radius <= 1, weights, 0)
-    empty = weights.sum(1, keepdim=True) == 0  # a ring thinner than a cell takes the cell nearest to it
-    nearest = F.one_hot((place - torch.arange(rings)[:, None]).abs().argmin(1), len(radius)).to(weights)
-    weights = torch.where(empty, nearest, weights)
-    return weights / weights.sum(1, keepdim=True)
+    centers = bev.grid.bev_centers(bev.stride).flatten(0, 1)
+    half = (centers.amax(0) - centers.amin(0)) / 2
+    radius = (torch.arange(rings) + 0.5) / rings * half.min()
+    angle = torch.arange(angles) * (2 * math.pi / angles)
+    places = radius[:, None, None] * torch.stack([angle.cos(), angle.sin()], 1)
+    return (places / half.clamp(min=1e-6))[None]
 
 
 def _positive(value: int) -> int:
     if value < 1:
-        raise ConfigError(f"channels and rings of a place head must be at least 1, got {value}")
+        raise ConfigError(f"numbers of a place head must be at least 1, got {value}")
     return value
 
 

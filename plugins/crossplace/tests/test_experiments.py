@@ -31,10 +31,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("bev")
     drive(folder)
     options = (
-        f"experiment=place_bev dataset.bev_place.root={folder} dataset.bev_place.size=31 splits.train=00 splits.val=00 "
-        "head.place_bev.channels=16 head.place_bev.rings=3 loader.batch_size=16 trainer.max_epochs=2 "
-        "trainer.check_val_every_n_epoch=2 metric.recall_at.gap=1 logger=none trainer.enable_progress_bar=false "
-        f"trainer.accelerator=cpu hydra.run.dir={folder}/run"
+        f"experiment=place_bev dataset.bev_place.root={folder} dataset.bev_place.size=31 hydra.run.dir={folder}/run "
+        "backbone.equivariant_bev.turns=4 backbone.equivariant_bev.channels=[2,4] "
+        "backbone.equivariant_bev.halve=[true,false] head.place_bev.channels=16 head.place_bev.rings=3 "
+        "loader.batch_size=16 trainer.max_steps=6 metric.recall_at.gap=1 logger=none "
+        "trainer.enable_progress_bar=false trainer.accelerator=cpu"
     )
     assert main(["train", *options.split()]) == 0
     return folder, next(folder.glob("run/checkpoints/last*.ckpt"))

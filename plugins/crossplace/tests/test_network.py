@@ -108,17 +108,34 @@ def bev_descriptor(features: Tensor) -> Tensor:
         return head(backbone(BEV(features, GRID)), meta("lidar")).vector
 
 
-def test_rings_do_not_see_quarter_turns_of_their_map() -> None:
+def test_descriptors_of_maps_do_not_see_the_heading_but_the_arrangement() -> None:
     head = PlaceBEVHead(Spec(BEV, 4, 4, GRID), channels=16, rings=5)
     features = torch.rand(1, 4, 38, 38)
-    weights = head.ring.view(5, 38, 38)  # type: ignore[operator]
-    assert weights.sum((1, 2)).tolist() == pytest.approx([1] * 5)
-    inner = Grid((-30.4, -30.4, -3.0), (30.4, 30.4, 3.0), (0.4, 0.4, 6.0))  # a whole number of cells at stride 4
-    head = PlaceBEVHead(Spec(BEV, 4, 4, inner), channels=16, rings=5)
-    one, other = (head(BEV(f, inner, 4), meta("lidar")).vector for f in (features, features.rot90(1, (2, 3))))
-    assert torch.allclose(one, other, atol=1e-6)
-    moved = head(BEV(features.roll(5, 2), inner, 4), meta("lidar")).vector
+    one, other = (head(BEV(f, GRID, 4), meta("lidar")).vector for f in (features, features.rot90(1, (2, 3))))
+    assert torch.allclose(one, other, atol=1e-5)
+    moved = head(BEV(features.roll(5, 2), GRID, 4), meta("lidar")).vector
     assert (one - moved).norm() > 1e-3
+    # the same things on every ring, but not in the same directions: no mean over rings tells these apart
+    ahead, across = torch.zeros(2, 1, 4, 38, 38)
+    for row in (9, 28):
+        ahead[..., row, 18:20] = 1
+        across[..., row, 18:20] = 1
+    across[..., 28, 18:20], across[..., 18:20, 28] = 0, 1
+    line, corner = (head(BEV(f, GRID, 4), meta("lidar")).vector for f in (ahead, across))
+    assert (line - corner).norm() > 0.05
+
+
+def test_rings_end_at_the_nearest_border() -> None:
+    wide = Grid((-32.0, -16.0, -1.0), (32.0, 16.0, 1.0), (1.0, 1.0, 2.0))
+    features = torch.zeros(1, 1, 32, 64)
+    features[..., :15] = features[..., -15:] = 1  # farther than 16 m along x
+    head = PlaceBEVHead(Spec(BEV, 1, 1, wide), channels=8, rings=4, angles=16)
+    seen, nothing = (head(BEV(f, wide), meta("lidar")).vector for f in (features, torch.zeros_like(features)))
+    assert torch.allclose(seen, nothing, atol=1e-5)
+    features[..., 12, 36] = 1
+    assert not torch.allclose(head(BEV(features, wide), meta("lidar")).vector, nothing, atol=1e-3)
+    with pytest.raises(ConfigError, match="16 angles have 9 frequencies, not 12"):
+        PlaceBEVHead(Spec(BEV, 1, 1, wide), angles=16, frequencies=12)
 
 
 def test_more_rings_than_cells_still_give_numbers() -> None:
