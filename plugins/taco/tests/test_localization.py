@@ -290,12 +290,16 @@ def test_loss_on_almost_nothing(count: int, ok: bool) -> None:
 @pytest.mark.parametrize("change", [RandomShift(distance=2.0, probability=1.0), RandomRotation(angle=0.2)])
 def test_augmentation_keeps_places_and_what_is_in_a_box(change: RandomShift | RandomRotation) -> None:
     frame = frames(1)[0]
+    points, poses = frame.inputs["points"], frame.targets.poses
+    assert poses is not None
+    exact = frame.targets.replace(poses=poses.replace(matrix=poses.matrix.double()))
+    frame = Frame({"points": points.replace(xyz=points.xyz.double())}, exact, frame.meta)
     for seed in range(5):
         moved = change(frame, np.random.default_rng(seed))
         places = [
             transform(f.targets.poses.matrix[0].double(), f.inputs["points"].xyz.double()) for f in (frame, moved)
         ]  # type: ignore[union-attr]
-        torch.testing.assert_close(*places, atol=1e-4, rtol=0)
+        torch.testing.assert_close(*places, atol=1e-5, rtol=0)
         inside = [
             points_in_boxes_mask(f.inputs["points"].xyz.double(), f.targets.boxes.tensor.double())
             for f in (frame, moved)
