@@ -301,20 +301,23 @@ class Panorama(Transform):
 class RandomHeading(Transform):
     """Another heading of the vehicle: panoramas are rolled, bird's-eye views turned about their middle.
 
-    The map of a bird's-eye view is interpolated; the sensor is in its middle. Poses stay: losses on places do not look
-    at the heading.
+    The map of a bird's-eye view is interpolated; the sensor is in its middle. With `shift` it is moved too, as if the
+    vehicle had driven a little beside. Poses stay: losses on places do not look at the heading, nor at so little.
     """
 
     train_only = True
 
-    def __init__(self, *, angle: float = math.pi) -> None:
-        """Options: angle, the heading changes by up to so much to either side, radians."""
-        self.angle = angle
+    def __init__(self, *, angle: float = math.pi, shift: float = 0.0) -> None:
+        """Options: angle, the heading changes by up to so much to either side, radians; shift, of bird's-eye views
+        along each axis, up to so many metres."""
+        self.angle, self.shift = angle, shift
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """The turned frame; all its panoramas and maps turn alike."""
         angle = float(rng.uniform(-self.angle, self.angle))
-        return Frame({name: turned(value, angle) for name, value in frame.inputs.items()}, frame.targets, frame.meta)
+        x, y = (float(value) for value in rng.uniform(-self.shift, self.shift, 2))
+        inputs = {name: turned(value, angle, (x, y)) for name, value in frame.inputs.items()}
+        return Frame(inputs, frame.targets, frame.meta)
 
 
 class AnyHeading(RandomHeading):
@@ -323,14 +326,19 @@ class AnyHeading(RandomHeading):
     train_only = False
 
 
-def turned(value: Any, angle: float) -> Any:
-    """A panorama or bird's-eye view after the vehicle has turned right by `angle` radians; others stay as they are."""
+def turned(value: Any, angle: float, shift: tuple[float, float] = (0.0, 0.0)) -> Any:
+    """A panorama or bird's-eye view after the vehicle has turned right by `angle` radians; others stay as they are.
+
+    `shift`, metres along columns and rows: how far a bird's-eye view is moved.
+    """
     if isinstance(value, Image) and value.cameras[0].model == "equirectangular":
         step = round(angle / (2 * math.pi) * value.features.shape[3])
         return value.replace(features=value.features.roll(-step, 3))
     if isinstance(value, BEV):
         cos, sin = math.cos(angle), math.sin(angle)
-        matrix = torch.tensor([[[cos, sin, 0], [-sin, cos, 0]]]).expand(value.batch_size, -1, -1)
+        (x0, y0, _), (x1, y1, _) = value.grid.lower, value.grid.upper
+        across, down = 2 * shift[0] / (x1 - x0), 2 * shift[1] / (y1 - y0)  # in units of half the map
+        matrix = torch.tensor([[[cos, sin, across], [-sin, cos, down]]]).expand(value.batch_size, -1, -1)
         grid = torch.nn.functional.affine_grid(matrix, list(value.features.shape), align_corners=False)
         features = torch.nn.functional.grid_sample(value.features, grid, align_corners=False)
         return value.replace(features=features)

@@ -238,3 +238,11 @@ def test_turning_rolls_panoramas_and_turns_maps() -> None:
         turned(bev, math.pi / 2).features, bev.features.rot90(1, (2, 3)), atol=1e-5
     ) or torch.allclose(turned(bev, math.pi / 2).features, bev.features.rot90(-1, (2, 3)), atol=1e-5)
     assert torch.allclose(turned(turned(bev, math.pi), math.pi).features, bev.features, atol=1e-5)
+
+
+def test_views_are_moved_by_metres() -> None:
+    grid = Grid((-4.0, -4.0, -1.0), (4.0, 4.0, 1.0), (0.5, 0.5, 2.0))
+    bev = BEV(torch.rand(1, 1, 16, 16), grid)
+    moved = turned(bev, 0.0, (1.0, -0.5)).features
+    assert torch.allclose(moved[..., 1:, :-2], bev.features[..., :-1, 2:], atol=1e-5)
+    assert torch.equal(turned(bev, 0.0).features, turned(bev, 0.0, (0.0, 0.0)).features)
