@@ -28,9 +28,10 @@ class PlaceRecall(PlaceMetric):
     true revisits count. A match is right where the positions in the ground plane are less than a radius apart.
 
     `compute` gives for each direction and radius `recall@N`, `recall@1%` (a hundredth of the map, rounded, at least
-    one), `ap` and `ceiling`, the share of queries with a right place at all, as `2d3d_recall@1_10m`; for each direction
-    `2d3d_error`, the mean distance in metres of the best matches, and `2d3d_queries`; and `recall@1`, the mean of 2d3d
-    and 3d2d at the first radius, or of the directions that there are. Queries without any right place count as misses
+    one), `ap`, `ceiling`, the share of queries with a right place at all, and `chance`, the recall@1 of guessing, as
+    `2d3d_recall@1_10m`; for each direction `2d3d_error`, the mean distance in metres of the best matches, and
+    `2d3d_queries`; and `recall@1`, the mean of 2d3d and 3d2d at the first radius, or of the directions that there are.
+    Queries without any right place count as misses
     unless `exclude_hopeless`. Raises ConfigError for radii, counts and spacing that are not positive.
     """
 
@@ -97,12 +98,14 @@ class PlaceRecall(PlaceMetric):
         best, metres, count = found[:, 0], found[:, 1], len(there)
         figures = {"queries": float(len(found)), "error": float(metres[metres.isfinite()].mean().nan_to_num())}
         for place, radius in enumerate(self.radii):
-            rank, hope = found[:, 2 + 2 * place], found[:, 3 + 2 * place] > 0
+            rank, share = found[:, 2 + 2 * place], found[:, 3 + 2 * place]
+            hope = share > 0
             counted = hope if self.exclude_hopeless else torch.ones_like(hope)
             total = max(int(counted.sum()), 1)
             limits = {f"recall@{n}": n for n in self.counts} | {"recall@1%": max(round(count / 100), 1)}
             figures |= {f"{key}_{radius:g}m": float((rank <= n).sum()) / total for key, n in limits.items()}
             figures[f"ceiling_{radius:g}m"] = float(hope.sum()) / max(len(hope), 1)
+            figures[f"chance_{radius:g}m"] = float(share[counted].sum()) / total
             precision, recall = precision_recall(best, rank == 1, int(hope.sum()))
             gain = torch.diff(recall, prepend=recall.new_zeros(1))
             figures[f"ap_{radius:g}m"] = float((gain * precision).sum())
@@ -110,7 +113,7 @@ class PlaceRecall(PlaceMetric):
 
     def _search(self, vectors: Tensor, places: Tensor, rows: Tensor, there: Tensor) -> Tensor:
         """(Q, 2 + 2 R): distance of descriptors and metres to the best match, then for each radius the rank of the
-        first right place (inf for none; of equal distances the wrong one comes first) and whether there is one."""
+        first right place (inf for none; of equal distances the wrong one comes first) and the share of right ones."""
         distance = torch.cdist(vectors[rows].double(), vectors[there].double())
         metres = torch.cdist(places[rows, 2:4], places[there, 2:4], compute_mode="donot_use_mm_for_euclid_dist")
         searched = (places[rows, :1] != places[there, 0]) | ((places[rows, 1:2] - places[there, 1]).abs() >= self.apart)
@@ -119,8 +122,8 @@ class PlaceRecall(PlaceMetric):
         ties = metres.masked_fill(~searched | (distance > best[:, None]), -torch.inf).amax(1)
         columns = [best, torch.where(best.isfinite(), ties, torch.inf)]
         for radius in self.radii:
-            rank = rank_of_first(metres < radius, searched, distance)
-            columns += [rank, rank.isfinite()]
+            right = searched & (metres < radius)
+            columns += [rank_of_first(right, searched, distance), right.sum(1) / searched.sum(1).clamp(min=1)]
         return torch.stack([column.double() for column in columns], 1)
 
 

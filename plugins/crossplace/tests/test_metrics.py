@@ -33,6 +33,7 @@ def test_perfect_ranking_reaches_the_ceiling() -> None:
     for radius, share in ((1, 1 / 3), (2, 2 / 3), (5, 1)):
         assert found[f"2d3d_recall@1_{radius}m"] == pytest.approx(share)
         assert found[f"2d3d_ceiling_{radius}m"] == pytest.approx(share)
+        assert found[f"2d3d_chance_{radius}m"] == pytest.approx({1: 1, 2: 3, 5: 4}[radius] / 4 / 3)
     assert found["2d3d_error"] == pytest.approx((0.4 + 1.2 + 4) / 3)
     assert found["2d3d_queries"] == 3
     assert not any(key.startswith("3d2d") for key in found)  # nothing queries with the LiDAR
