@@ -250,7 +250,8 @@ def make_tracker(
 
 @dataclass(frozen=True)
 class Variant:
-    """A tracker to compare: with other options, without poses, or with a rule in place of the learned confidence."""
+    """A tracker to compare: with other options, without poses (but weights that were learned with them), or with a
+    rule in place of the learned confidence."""
 
     options: Mapping[str, Any] = field(default_factory=dict)
     posed: bool = True
@@ -290,16 +291,12 @@ def cross_validate(
     """
     made = {name: {rules: Mot3D(Spec(Tracks, classes=tuple(classes)), default_iou=IOU, rules=rules)
                    for rules in ("devkit", "clean")} for name in variants}  # fmt: skip
-    unposed = [_without_poses(entry) for entry in data]
     for number in progress(range(folds), "folds"):
-        for posed in sorted({variant.posed for variant in variants.values()}):
-            entries = data if posed else unposed
-            learnt = fit([entry for place, entry in enumerate(entries) if place % folds != number], classes, view)
-            for name, variant in variants.items():
-                if variant.posed == posed:
-                    tracker = _tracker_of(variant, learnt, classes, view)
-                    for entry in entries[number::folds]:
-                        _count(entry, tracker, made[name])
+        learnt = fit([entry for place, entry in enumerate(data) if place % folds != number], classes, view)
+        for name, variant in variants.items():
+            tracker = _tracker_of(variant, learnt, classes, view)
+            for entry in data[number::folds]:
+                _count(entry if variant.posed else _without_poses(entry), tracker, made[name])
     return {name: {rules: {key: float(value) for key, value in metric.compute().items()}
                    for rules, metric in metrics.items()} for name, metrics in made.items()}  # fmt: skip
 
