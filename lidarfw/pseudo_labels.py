@@ -120,6 +120,8 @@ class Loop:
         path, ours = self.folder / "settings.json", json.loads(json.dumps(asdict(self.settings)))
         if path.is_file():
             theirs = json.loads(path.read_text(encoding="utf-8"))
+            if not (self.folder / "round_1" / "data").is_dir():  # no pseudo-label was made yet
+                theirs |= {key: ours[key] for key in ("confident", "middling")}
             changed = [
                 f"  {key}: {theirs.get(key)} there, {ours[key]} here" for key in ours if ours[key] != theirs.get(key)
             ]
@@ -209,10 +211,26 @@ class Loop:
         model = checkpoint.load(_last(self.folder / f"round_{number - 1}")).to(device).eval()
         places = [(sequence, scan) for sequence, scans in self.unlabelled.items() for scan in scans]
         results = predict_frames(model, self._frames(model, {scan for _, scan in places}))
+        found, best = 0, [0.0] * len(self.classes)
         for (sequence, scan), result in zip(places, _with_progress(results, len(places), number), strict=True):
-            sure, unsure = split_by_score(result.of(Boxes), self.confident, self.settings.middling)
+            boxes = result.of(Boxes)
+            sure, unsure = split_by_score(boxes, self.confident, self.settings.middling)
+            best = [max(b, *boxes.score[boxes.label == label].tolist(), 0.0) for label, b in enumerate(best)]
             if len(sure):
+                found += 1
                 yield sequence, scan, sure, unsure
+        if not found:
+            raise DataError(self._nothing(number, len(places), best))
+
+    def _nothing(self, number: int, scans: int, best: Sequence[float]) -> str:
+        scores = ", ".join(
+            f"{n} {b:.2f} of {c:.2f}" for n, b, c in zip(self.classes, best, self.confident, strict=True)
+        )
+        return (
+            f"round {number}: no box of {scans} scans without labels is sure enough to learn from\n"
+            f"  highest scores: {scores}\n"
+            f"  fix: a longer training in another folder, or a lower --keep {self.classes[0]}=..."
+        )
 
     def _frames(self, model: PerceptionModel, chosen: set[Path]) -> Iterator[Frame]:
         """The frames of these scans as the model takes them."""

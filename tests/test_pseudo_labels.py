@@ -144,7 +144,20 @@ def test_what_cannot_be_is_refused(scans: Path, tmp_path: Path, capsys, changes,
     assert text in capsys.readouterr().err
 
 
+def test_a_model_that_is_never_sure_says_how_sure_it_was(scans: Path, tmp_path: Path, capsys) -> None:
+    command = ["pseudo-label", str(tmp_path), *overrides(scans), "--rounds", "1", "--keep"]
+    assert main([*command, "Car=1.0", "Pedestrian=1.0", "Cyclist=1.0"]) == 2
+    assert "highest scores: Car 0." in capsys.readouterr().err
+    assert (tmp_path / "round_0" / "round.json").is_file()
+    # scores may be lowered as long as nothing was learned from them
+    lower = Loop(tmp_path, Settings(tuple(overrides(scans)), confident=dict.fromkeys(CLASSES, 0.5)))
+    assert lower.confident == [0.5] * 3
+
+
 def test_other_settings_in_the_same_folder_are_refused(scans: Path, tmp_path: Path) -> None:
     Loop(tmp_path, Settings(tuple(overrides(scans))))
+    with pytest.raises(pseudo_labels.ConfigError, match=r"start: None there, a.ckpt here"):
+        Loop(tmp_path, Settings(tuple(overrides(scans)), start="a.ckpt"))
+    (tmp_path / "round_1" / "data").mkdir(parents=True)
     with pytest.raises(pseudo_labels.ConfigError, match=r"middling: 0.3 there, 0.2 here"):
         Loop(tmp_path, Settings(tuple(overrides(scans)), middling=0.2))
