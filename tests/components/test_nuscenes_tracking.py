@@ -74,6 +74,24 @@ def test_false_tracks_and_switches() -> None:
     assert clean["mota"] == pytest.approx(0.8)
 
 
+@pytest.mark.parametrize(
+    ("ids", "false", "motar", "mota"),
+    [([7] * 5 + [8], 1, 0.8, 0.4), ([7] * 8, 2, 0.75, 0.6), ([7] * 4, 5, 0.0, 0.0)],
+    ids=["a switch", "none", "more false ones than right ones"],
+)
+def test_motar_leaves_switches_out_as_the_devkit_does(ids: list[int], false: int, motar: float, mota: float) -> None:
+    """Ten objects in ten frames; MOTAR = 1 - FP / (matches that are no switch), the same at every recall reached."""
+    known = [{1: 10.0} for _ in range(10)]
+    found = [{track: 10.0} for track in ids] + [{} for _ in range(10 - len(ids))]
+    for frame in range(false):
+        found[frame] |= {9: 40.0}
+    result = figures(*[step(i, tracks, objects) for i, (tracks, objects) in enumerate(zip(found, known, strict=True))])
+    steady = ids.count(7) / 10
+    reached = sum(0.1 + 0.9 * k / 39 <= steady + 1e-9 for k in range(40))
+    assert result["amota"] == pytest.approx(motar * reached / 40)
+    assert result["mota"] == pytest.approx(mota)
+
+
 def test_an_object_keeps_its_track_while_that_is_near() -> None:
     """Another box comes nearer, but the first is still within 2 m; when it leaves there is a switch."""
     found = figures(

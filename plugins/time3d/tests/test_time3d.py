@@ -395,3 +395,32 @@ def test_moving_is_told_from_standing() -> None:
     moving = dict(zip(out[-1].boxes.center[:, 1].int().tolist(), out[-1].moving.tolist()))
     assert moving[0] > 2
     assert moving[8] < -2
+
+
+def test_two_boxes_at_one_place_are_two_tracks_and_ties_go_to_the_first() -> None:
+    """Section 12: one-to-one, the second starts a track of its own; equal boxes keep their ids frame by frame."""
+    twins = boxes([(10, 0), (10, 0)])
+    out = follow(small(affinity="geometric"), [boxes([(10, 0)]), twins, twins, twins])
+    assert [tracks.id.tolist() for tracks in out] == [[1], [1, 2], [1, 2], [1, 2]]
+
+
+def test_lost_objects_end_when_no_frame_in_memory_has_them() -> None:
+    car = [(10, 0)]
+    out = follow(small(affinity="geometric", memory=3), [boxes(car)] * 2 + [boxes([])] * 2 + [boxes(car)])
+    assert out[-1].id.tolist() == [1]
+    out = follow(small(affinity="geometric", memory=3), [boxes(car)] * 2 + [boxes([])] * 3 + [boxes(car)])
+    assert out[-1].id.tolist() == [2]
+
+
+def test_the_state_stays_small_over_many_frames() -> None:
+    """Objects come and go: only five frames and the tracks in them are kept."""
+    tracker, rng = small(affinity="geometric"), np.random.default_rng(0)
+    state, sizes = tracker.start(), []
+    for index in range(600):
+        step(
+            tracker, state, index, boxes([(10 + 5 * k + index % 150, 3.0 * k) for k in range(3) if rng.random() < 0.8])
+        )
+        sizes.append(len(state.id))
+    assert state.next_id > 10
+    assert max(sizes) < 8
+    assert len(state.memory) == 5
