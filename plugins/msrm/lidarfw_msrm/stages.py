@@ -17,6 +17,7 @@ import itertools
 import json
 import math
 import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -133,7 +134,10 @@ def joined(parts: Sequence[Metrics]) -> Metrics:
 
 def figures(metrics: Metrics) -> dict[str, float]:
     """By name."""
-    return {f"{prefix}{key}": value for prefix, metric in metrics.items() for key, value in metric.compute().items()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # torchmetrics: compute before update
+        computed = {prefix: metric.compute() for prefix, metric in metrics.items()}
+    return {f"{prefix}{key}": value for prefix, one in computed.items() for key, value in one.items()}
 
 
 def resampled(frames: Sequence[Metrics], meta: Sequence[FrameMeta], samples: int, block: int) -> list[dict[str, float]]:
@@ -183,7 +187,8 @@ def draw(path: Path, one: Seen, stages: int) -> bool:
     found = {name: detections(one.stages, chosen) for name, chosen in ways(stages).items()}
     if truth is None or len(truth) == 0 or len(found["vote"]) == 0:
         return False
-    overlap = iou_3d(truth.tensor, found["vote"].tensor).amax(1)
+    same = truth.label[:, None] == found["vote"].label
+    overlap = torch.where(same, iou_3d(truth.tensor, found["vote"].tensor), 0.0).amax(1)
     rows = [row for row in overlap.argsort(descending=True).tolist() if overlap[row] > 0][:SHOWN]
     if not rows:
         return False
@@ -200,7 +205,8 @@ def draw(path: Path, one: Seen, stages: int) -> bool:
 
 
 def _panel(axes: Axes, points: Points, truth: Boxes, boxes: Boxes, name: str) -> None:
-    """One object from above: points, truth in black, the box that overlaps it most in red."""
+    """One object from above: points, truth in black, the box of its class that overlaps it most in red."""
+    boxes = boxes[boxes.label == truth.label]
     x, y = truth.center[0, :2].tolist()
     axes.scatter(points.xyz[:, 0], points.xyz[:, 1], s=4, c="#888888", linewidths=0)
     axes.set(xlim=(x - AROUND, x + AROUND), ylim=(y - AROUND, y + AROUND), aspect="equal", xticks=[], yticks=[])
