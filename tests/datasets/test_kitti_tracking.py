@@ -94,6 +94,22 @@ def test_frames_are_the_scans_that_are_there(root):
     assert data[3].targets.boxes.center[0, 0] == pytest.approx(20.33 - 5 * SPEED, abs=1e-4)
 
 
+def test_pictures_are_padded_to_one_size(root):
+    Image.new("RGB", (1242, 375), (255, 0, 51)).save(root / "training/image_02/0000/000001.png")
+    data = dataset(root, image=True)
+    image = data[1].inputs["image"]
+    assert image.features.shape == (1, 3, 384, 1248)
+    assert image.features[0, :, 100, 100].tolist() == pytest.approx([1, 0, 0.2])
+    assert image.features[0, :, 380:].abs().max() == image.features[0, :, :, 1244:].abs().max() == 0
+    camera = image.cameras[0]
+    assert (camera.width, camera.height) == (1248, 384)
+    assert camera.intrinsics == data[1].meta.cameras["image"].intrinsics
+    assert data.spec.inputs["image"].channels == 3
+    (root / "training/image_02/0000/000001.png").unlink()
+    with pytest.raises(DataError, match=r"0000/000001.png: no such picture"):
+        data[1]
+
+
 def test_points_of_the_car_are_in_its_box(root):
     for frame in (dataset(root)[i] for i in range(4)):
         points = frame.inputs["points"].xyz
@@ -180,7 +196,7 @@ def test_import_and_spec_do_not_import_torch():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-@pytest.mark.parametrize("options", [{"sweeps": 3, "pose": True}, {"poses": ""}])
+@pytest.mark.parametrize("options", [{"sweeps": 3, "pose": True}, {"poses": ""}, {"image": True}])
 def test_keeps_the_rules_of_a_dataset(root, options, monkeypatch):
     monkeypatch.setattr(KittiTrackingDataset, "example", {"root": str(root), "split": "all", **options}, False)
     results = run_checks(KittiTrackingDataset)

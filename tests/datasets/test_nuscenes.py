@@ -156,6 +156,18 @@ def test_cameras(root):
     assert depth[0] == pytest.approx(ahead, abs=1e-4)
 
 
+def test_the_picture_of_a_camera_is_an_input(root):
+    Image.new("RGB", (800, 600), (0, 255, 51)).save(root / "samples/CAM_FRONT/scene-0061_1.jpg")
+    data = dataset(root, image="CAM_FRONT")
+    image = data[1].inputs["image"]
+    assert image.features.shape == (1, 3, 600, 800)
+    assert image.features[0, :, 300, 400].tolist() == pytest.approx([0, 1, 0.2], abs=0.02)
+    assert image.cameras == (data[1].meta.cameras["CAM_FRONT"],)
+    assert set(data.spec.inputs) == {"points", "image"}
+    with pytest.raises(DataError, match="no picture of CAM_BACK; of: CAM_FRONT"):
+        dataset(root, image="CAM_BACK")[1]
+
+
 def test_splits(root):
     def scenes(split):
         return [drive.name for drive in dataset(root, split).drives]
