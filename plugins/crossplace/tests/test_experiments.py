@@ -34,7 +34,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
         f"experiment=place_bev dataset.bev_place.root={folder} dataset.bev_place.size=31 hydra.run.dir={folder}/run "
         "backbone.equivariant_bev.turns=4 backbone.equivariant_bev.channels=[2,4] "
         "backbone.equivariant_bev.halve=[true,false] head.place_bev.channels=16 head.place_bev.rings=3 "
-        "loader.batch_size=16 trainer.max_steps=6 metric.recall_at.gap=1 logger=none "
+        "loader.batch_size=16 trainer.max_epochs=2 metric.recall_at.gap=1 logger=none "
         "trainer.enable_progress_bar=false trainer.accelerator=cpu"
     )
     assert main(["train", *options.split()]) == 0
