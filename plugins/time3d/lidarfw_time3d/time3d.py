@@ -177,7 +177,7 @@ class Time3D(Tracker):
 
     def forward(self, boxes: Boxes, meta: list[FrameMeta], pose: Poses | None = None) -> Time3DOutput:
         """Affinities of all pairs of frames of the batch."""
-        boxes = boxes if self.end_to_end else boxes.detach()
+        boxes = _last_stage(boxes if self.end_to_end else boxes.detach())
         count = boxes.batch_size
         poses = torch.eye(4, device=boxes.center.device, dtype=torch.float64).repeat(count, 1, 1)
         if pose is not None:
@@ -359,6 +359,11 @@ class Time3D(Tracker):
         alive = np.isin(state.id, there)
         for name in ("id", "label", "hits", "center", "velocity", "seen", "moving"):
             setattr(state, name, getattr(state, name)[alive])
+
+
+def _last_stage(boxes: Boxes) -> Boxes:
+    """Of a cascade the boxes of its last stage: in training no postprocessor has joined those of one object yet."""
+    return boxes if boxes.stage is None or not len(boxes) else boxes[boxes.stage == boxes.stage.max()]
 
 
 def _pairs(meta: list[FrameMeta], memory: int) -> list[tuple[int, int]]:

@@ -375,6 +375,13 @@ def test_boxes_of_pictures_are_matched_by_their_rectangles() -> None:
     assert identities(far.replace(box2d=far.box2d + 200), targets).tolist() == [-1]
 
 
+def test_of_a_cascade_the_last_stage_is_learned_from() -> None:
+    found = [boxes([(10, 0), (10.1, 0), (20, 5), (20.1, 5)]).replace(stage=torch.tensor([0, 1, 0, 1]))] * 2
+    output = small().train()(Boxes.cat(found, as_batch=True), [FrameMeta(str(t), "s", t, t / 10) for t in range(2)])
+    assert output.boxes.center[:, 0].tolist() == pytest.approx([10.1, 20.1] * 2)
+    assert output.logits.shape == (1, 3, 3)
+
+
 def test_losses_without_pairs_labels_or_boxes_are_zero() -> None:
     tracker = small().train()
     output, targets = _batch(tracker)
