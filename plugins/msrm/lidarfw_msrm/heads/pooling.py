@@ -94,10 +94,31 @@ class Aggregation(nn.Module):
 
     def forward(self, transformed: Tensor, sites: Sites, xyz: Tensor, pairs: Tensor) -> Tensor:
         """(M, C') of the points xyz (M, 3) with their pairs (P, 2); 0 goes in where a point has no neighbour."""
-        query, site = pairs.unbind(1)
-        offset = self.offset_norm(self.offset(sites.xyz[site] - xyz[query]))
-        pooled: Tensor = self.out(scatter_max(torch.relu(transformed[site] + offset), query, len(xyz)))
+        pool = self._pool_pairs if self.training else self._pool_sites
+        pooled: Tensor = self.out(pool(transformed, sites, xyz, *pairs.unbind(1)))
         return pooled
+
+    def _pool_pairs(self, transformed: Tensor, sites: Sites, xyz: Tensor, query: Tensor, site: Tensor) -> Tensor:
+        """max over the neighbours v of point g of relu(t_v + norm(W (x_v - x_g))); norm looks at all pairs."""
+        offset = self.offset_norm(self.offset(sites.xyz[site] - xyz[query]))
+        return scatter_max(torch.relu(transformed[site] + offset), query, len(xyz))
+
+    def _pool_sites(self, transformed: Tensor, sites: Sites, xyz: Tensor, query: Tensor, site: Tensor) -> Tensor:
+        """The same where the normalisation is fixed, A x + b: relu(max(t_v + A x_v) - A x_g + b), since A x_g and b are
+        the same for all neighbours. Nothing is left to do for each pair but to take the maximum."""
+        norm = self.offset_norm
+        gain = norm.weight / (norm.running_var + norm.eps).sqrt()  # type: ignore[operator]
+        turn = self.offset.weight * gain[:, None]
+        here = transformed + _product(sites.xyz, turn)
+        highest = scatter_max(here[site], query, len(xyz))
+        pooled = torch.relu(highest - _product(xyz, turn) + (norm.bias - norm.running_mean * gain))  # type: ignore[operator]
+        found = torch.zeros(len(xyz), 1, dtype=pooled.dtype, device=pooled.device).index_fill(0, query, 1)
+        return pooled * found
+
+
+def _product(xyz: Tensor, weight: Tensor) -> Tensor:
+    """(N, C') of (N, 3) and (C', 3), not as a matrix product: at half precision, places would be off by decimetres."""
+    return (xyz[:, :, None] * weight.T).sum(1)
 
 
 class SitePooling(nn.Module):
