@@ -82,7 +82,8 @@ class BEVPlaceDataset(Dataset):
     which way is ahead does not matter to a descriptor that is blind to the heading.
 
     A split is names of drives joined by `+`; NAME:x<100 keeps the frames with x below 100 m, and likewise > and y, so
-    that a region of a drive can be held out.
+    that a region of a drive can be held out. Train on several drives only if they share a map: losses look at
+    positions alone.
     """
 
     example: ClassVar[dict[str, Any]] = {"split": "00"}
