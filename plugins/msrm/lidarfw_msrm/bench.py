@@ -9,6 +9,7 @@ other load on the machine falls on all columns alike.
 from __future__ import annotations
 
 import argparse
+import copy
 import json
 import statistics
 import sys
@@ -67,7 +68,7 @@ def by_stages(model: PerceptionModel, head: MSRMHead, batch: Batch, rounds: int)
 
 
 def by_regions(model: PerceptionModel, head: MSRMHead, batch: Batch, rounds: int) -> dict[str, tuple[float, float]]:
-    """Milliseconds of a scan, and MB that a training step keeps for its gradients, by the number of regions."""
+    """Milliseconds of a scan, and MB that a training step on it keeps for its gradients, by the number of regions."""
     before = head.regions
 
     def run(regions: int) -> None:
@@ -86,7 +87,8 @@ def by_regions(model: PerceptionModel, head: MSRMHead, batch: Batch, rounds: int
 
 
 def kept_for_gradients(model: PerceptionModel, batch: Batch) -> int:
-    """Bytes of the tensors that a pass in evaluation mode keeps for the backward pass; each storage once."""
+    """Bytes of the tensors that a training step keeps for its backward pass; each storage once."""
+    learning = copy.deepcopy(model).train()  # running statistics of the model itself stay as they are
     storages: dict[int, int] = {}
 
     def keep(tensor: Tensor) -> Tensor:
@@ -94,7 +96,7 @@ def kept_for_gradients(model: PerceptionModel, batch: Batch) -> int:
         return tensor
 
     with torch.enable_grad(), torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        model(batch)
+        learning(batch)
     return sum(storages.values())
 
 
