@@ -220,7 +220,7 @@ class RangeCrop(Transform):
 
     Little of a scan moves: with the share `moving` the sector holds a random point of a class other than the first,
     where there is one; else it lies anywhere. Networks that fit a sector fit the full turn, so that evaluation sees
-    all of it.
+    all of it. Of an image that is not wider than the sector all columns are kept.
     """
 
     train_only = True
@@ -234,26 +234,22 @@ class RangeCrop(Transform):
         self.columns, self.moving = columns, moving
 
     def spec(self, data: DataSpec) -> DataSpec:
-        """Unchanged. ConfigError without a range image, or one narrower than the sector."""
+        """Unchanged. ConfigError without a range image."""
         view = data.inputs[IMAGE].geometry if IMAGE in data.inputs else None
         if not isinstance(view, RangeView):
             raise ConfigError("range_crop needs the range image.\n  fix: transform=[...,range_projection,range_crop]")
-        if view.width < self.columns:
-            raise ConfigError(
-                f"range_crop.columns is {self.columns}, the range image has {view.width}.\n"
-                f"  fix: transform.range_crop.columns={view.width // 2 // _STRIDE * _STRIDE}"
-            )
         return data
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """The frame with a narrower range image, and the points in it."""
         image: RangeImage = frame.inputs[IMAGE]
         width = image.mask.shape[2]
+        columns = min(self.columns, width)
         first = self._first(frame, width, rng)
         place = (image.pixel % width - first) % width
-        kept = (image.pixel >= 0) & (place < self.columns)
-        pixel = image.pixel[kept] // width * self.columns + place[kept]
-        chosen = (torch.arange(self.columns) + first) % width
+        kept = (image.pixel >= 0) & (place < columns)
+        pixel = image.pixel[kept] // width * columns + place[kept]
+        chosen = (torch.arange(columns) + first) % width
         values = {name: getattr(image, name)[..., chosen] for name in ("features", "xyz", "mask")}
         labels, maps = frame.targets.points, frame.targets.pixels
         targets = frame.targets.replace(

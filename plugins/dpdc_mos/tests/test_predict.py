@@ -22,8 +22,8 @@ from lidarfw.testing.synthetic import SyntheticDataset
 from lidarfw.types import PointLabels, collate
 
 SMALL = [
-    "experiment=mos_town", "dataset=semantic_kitti", "~dataset.town_mos", "dataset.semantic_kitti.root=nowhere",
-    "dataset.semantic_kitti.task=moving", "dataset.semantic_kitti.sweeps=3", "dataset.semantic_kitti.pose=true",
+    "experiment=mos_finetune", "~dataset.town_mos", "dataset.semantic_kitti.root=nowhere",
+    "dataset.semantic_kitti.task=moving", "dataset.semantic_kitti.sweeps=5", "dataset.semantic_kitti.pose=true",
     "backbone.dpdc.stem=8", "backbone.dpdc.widths=[16,16,16]",
     "transform.range_projection.height=16", "transform.range_projection.width=128",
 ]  # fmt: skip
@@ -37,7 +37,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = compose(SMALL)
     wired = plan(config)
     model = build(wired)
-    data = SyntheticDataset(frames=4, sequence_length=4, points=2048, sweeps=3, pose=True)
+    data = SyntheticDataset(frames=4, sequence_length=4, points=2048, sweeps=5, pose=True)
     frames = [data[index] for index in range(4)]
     for change in make_transforms(config, training=False):
         frames = [change(frame, np.random.default_rng(0)) for frame in frames]
@@ -105,7 +105,7 @@ def test_past_scans_come_with_the_frames(checkpoint: Path, sequence: Path) -> No
     """The frames of a bare folder are those that the dataset gives, residual images included."""
     model = lidarfw.load(checkpoint)
     frames = SequenceFrames(model, sequence)
-    data = SemanticKittiDataset(root=str(sequence.parents[1]), split="08", task="moving", sweeps=3, pose=True)
+    data = SemanticKittiDataset(root=str(sequence.parents[1]), split="08", task="moving", sweeps=5, pose=True)
     data.labelled = False
     rng = np.random.default_rng(0)
     for index in (0, 1, 4):
@@ -115,18 +115,22 @@ def test_past_scans_come_with_the_frames(checkpoint: Path, sequence: Path) -> No
         frame = frames[index]
         assert torch.equal(frame.inputs["range"].features, expected.inputs["range"].features)
         assert torch.equal(frame.inputs["pose"].matrix, expected.inputs["pose"].matrix)
-        assert bool((frame.inputs["range"].features[:, 2:] > 0).any()) == (index > 0)
+        assert bool((frame.inputs["range"].features[:, 1:] != 0).any()) == (index > 0)
 
 
 def test_merged_for_inference_end_to_end(checkpoint: Path, sequence: Path) -> None:
-    """Projection, residuals, network, neighbours and filter: the same probabilities to 1e-5, fewer weights."""
+    """Projection, residuals, network, neighbours and filter: the same probabilities, fewer weights.
+
+    Norms folded in move the rounding of every layer, and the filter adds up two frames: 5e-5 in float32, and nothing
+    but rounding (test_weights_are_merged_in_float64).
+    """
     model = lidarfw.load(checkpoint)
     merged = lidarfw.merge(model)
     results = [
         [r.of(PointLabels).probability for r in predict_frames(m, _all(m, sequence), True)] for m in (model, merged)
     ]
     for one, other in zip(*results, strict=True):
-        assert float((one - other).abs().max()) <= 1e-5
+        assert float((one - other).abs().max()) <= 5e-5
     sizes = [sum(p.numel() for p in m.parameters()) for m in (model, merged)]
     assert sizes[1] < sizes[0]
 
