@@ -14,7 +14,7 @@ import numpy as np
 from lidarfw._lazy import LazyModule
 from lidarfw.errors import ConfigError
 from lidarfw.interfaces.data import Transform
-from lidarfw.types import DataSpec, Frame, PointLabels, Points, RangeImage, RangeView, Spec
+from lidarfw.types import Boxes, DataSpec, Frame, PointLabels, Points, RangeImage, RangeView, Spec, Tracks
 
 if TYPE_CHECKING:
     import torch
@@ -220,7 +220,8 @@ class RangeCrop(Transform):
 
     Little of a scan moves: with the share `moving` the sector holds a random point of a class other than the first,
     where there is one; else it lies anywhere. Networks that fit a sector fit the full turn, so that evaluation sees
-    all of it. Of an image that is not wider than the sector all columns are kept.
+    all of it. Of an image that is not wider than the sector all columns are kept. Boxes
+    are left out: most would be empty.
     """
 
     train_only = True
@@ -234,11 +235,11 @@ class RangeCrop(Transform):
         self.columns, self.moving = columns, moving
 
     def spec(self, data: DataSpec) -> DataSpec:
-        """Unchanged. ConfigError without a range image."""
+        """Without boxes. ConfigError without a range image."""
         view = data.inputs[IMAGE].geometry if IMAGE in data.inputs else None
         if not isinstance(view, RangeView):
             raise ConfigError("range_crop needs the range image.\n  fix: transform=[...,range_projection,range_crop]")
-        return data
+        return DataSpec(data.inputs, data.targets - {Boxes, Tracks}, data.classes, data.sweeps)
 
     def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
         """The frame with a narrower range image, and the points in it."""
@@ -255,6 +256,9 @@ class RangeCrop(Transform):
         targets = frame.targets.replace(
             points=None if labels is None else labels[kept],
             pixels=None if maps is None else maps.replace(features=maps.features[..., chosen]),
+            boxes=None,
+            ignored=None,
+            tracks=None,
         )
         inputs = {**frame.inputs, "points": frame.inputs["points"][kept], IMAGE: image.replace(**values, pixel=pixel)}
         return frame.replace(inputs=inputs, targets=targets)
