@@ -130,7 +130,7 @@ class VoxelLabelsHead(Head):
     A point outside the grid has no class: all its probabilities are 0.
     """
 
-    defaults = {"loss": ["point_cross_entropy"], "metric": ["point_iou"]}
+    defaults = {"loss": ["point_cross_entropy"], "metric": ["mean_iou"]}
 
     def __init__(self, voxels: Spec, points: Spec, data: DataSpec) -> None:
         super().__init__()
