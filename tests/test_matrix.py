@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidarfw import assembly, declaration
+from lidarfw import assembly, declaration, registry
 from lidarfw.config import compose, to_plain
 from lidarfw.testing.checks.compare import finite
 from lidarfw.testing.synthetic import SyntheticDataset
@@ -31,7 +31,7 @@ RANGE = {"lower": (0.0, -16.0, -3.0), "upper": (32.0, 16.0, 1.0)}  # metres
 
 @pytest.fixture(scope="module")
 def sizes() -> dict[str, dict[str, Any]]:
-    """Options that make each component small: those of its preset NAME_small, and a short range."""
+    """Options that make each component small: those of its preset NAME_small, what its class says, a short range."""
     found = {}
     for slot in ("backbone", "neck", "head"):
         for name in table.repository_names(slot):
@@ -39,6 +39,7 @@ def sizes() -> dict[str, dict[str, Any]]:
             node = to_plain(compose([f"{slot}={name}{'_small' * small}", *(["neck=[]"] if slot != "neck" else [])]))
             options = {k: v for k, v in node[slot][name].items() if k not in ("type", "inputs")}
             known = declaration.read(slot, name).options
+            options |= getattr(registry.load(slot, name), "example", {})
             found[f"{slot}.{name}"] = options | {k: v for k, v in RANGE.items() if k in known}
     return found
 
