@@ -69,5 +69,5 @@ def test_four_scans_by_heart() -> None:
         found = net.eval().decode(net(proposals, bev, None, points))
     by_stage = [overlap(found, truth, stage) for stage in range(4)]
     assert by_stage[3] > 0.9, by_stage
-    assert by_stage[3] > by_stage[1] - 0.02, by_stage  # both are near what these proposals allow
+    assert by_stage[3] >= by_stage[1], by_stage
     assert by_stage[1] > by_stage[0] + 0.2, by_stage
