@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
 from typing import Any
 
+import compat_table as table
 import numpy as np
 import pytest
 import torch
@@ -17,11 +16,7 @@ from lidarfw.testing.checks.compare import finite
 from lidarfw.testing.synthetic import SyntheticDataset
 from lidarfw.types import Batch, Boxes, Frame, collate
 
-TOOL = Path(__file__).resolve().parents[1] / "tools" / "compat_table.py"
-_spec = importlib.util.spec_from_file_location("compat_table", TOOL)
-table = sys.modules["compat_table"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(table)
-
+ROOT = Path(__file__).resolve().parents[1]
 AT_MOST = 40  # combinations that are built; with more, an even choice of them
 POINTS = 500
 VALID = table.valid_combinations()
@@ -35,7 +30,7 @@ def sizes() -> dict[str, dict[str, Any]]:
     found = {}
     for slot in ("backbone", "neck", "head"):
         for name in table.repository_names(slot):
-            small = Path(TOOL.parents[1] / "conf" / slot / f"{name}_small.yaml").exists()
+            small = (ROOT / "conf" / slot / f"{name}_small.yaml").exists()
             node = to_plain(compose([f"{slot}={name}{'_small' * small}", *(["neck=[]"] if slot != "neck" else [])]))
             options = {k: v for k, v in node[slot][name].items() if k not in ("type", "inputs")}
             known = declaration.read(slot, name).options

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
@@ -16,19 +13,7 @@ from lidarfw.types import FrameMeta, FrameResult, PointLabels, Points, Poses, Ra
 
 from lidarfw_dpdc_mos.study import Figures, Seen
 
-TOOL = Path(__file__).parents[3] / "tools" / "mos_transfer.py"
-pytestmark = pytest.mark.skipif(not TOOL.is_file(), reason="the tools are in the repository only")
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mos_transfer", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["mos_transfer"] = module
-    spec.loader.exec_module(module)
-    return module
+tool = pytest.importorskip("mos_transfer", reason="the tools are in the repository only")
 
 
 def seen(moving: list[int], probability: list[float], counts: bool, place: int) -> Seen:
@@ -43,14 +28,14 @@ def seen(moving: list[int], probability: list[float], counts: bool, place: int) 
     return Seen(result, points, labels, torch.tensor(moving), pose, counts)
 
 
-def test_only_frames_with_enough_past_count(tool: ModuleType) -> None:
+def test_only_frames_with_enough_past_count() -> None:
     frames = [seen([1, 0], [0.1, 0.9], False, 0), seen([1, 0, 1], [0.9, 0.1, 0.2], True, 1)]
     flags = tool.judge(frames)
     assert set(flags) == {"", " + filter"}
     assert tool.count(frames, flags[""]).to_plain()["iou"] == 0.5
 
 
-def test_points_of_all_sequences_are_counted_together(tool: ModuleType) -> None:
+def test_points_of_all_sequences_are_counted_together() -> None:
     table = {"network": {"00": Figures(right=10), "04": Figures(wrong=10, missed=10)}}
     assert tool.pooled(table["network"].values()).to_plain()["iou"] == pytest.approx(1 / 3)
     header, _, row = tool.markdown(table).splitlines()
@@ -58,7 +43,7 @@ def test_points_of_all_sequences_are_counted_together(tool: ModuleType) -> None:
     assert row == "| network | 100.0 | 0.0 | 33.3 | 50.0 | 50.0 |"
 
 
-def test_the_picture_tells_right_wrong_and_missed(tool: ModuleType) -> None:
+def test_the_picture_tells_right_wrong_and_missed() -> None:
     frame = seen([1, 1, 0, 0, -1], [1, 0, 1, 0, 1], True, 0)
     shown = tool.picture(frame, frame.labels.probability[:, 1] > 0.5)
     colours = {tuple(c) for c in shown.reshape(-1, 3).tolist()}
@@ -66,9 +51,7 @@ def test_the_picture_tells_right_wrong_and_missed(tool: ModuleType) -> None:
     assert len(shown) == 8 * 4
 
 
-def test_the_sequence_held_out_is_not_trained_on(
-    tool: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_sequence_held_out_is_not_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[list[str]] = []
     monkeypatch.setattr(subprocess, "run", lambda command, check: calls.append(command))
     checkpoint = tool.finetune("ROOT", Path("town.ckpt"), "04", ["00", "04", "10"], tmp_path / "04", ["optimizer.lr=1"])
@@ -80,7 +63,7 @@ def test_the_sequence_held_out_is_not_trained_on(
     assert len(calls) == 1
 
 
-def test_one_sequence_is_not_enough(tool: ModuleType, tmp_path: Path) -> None:
+def test_one_sequence_is_not_enough(tmp_path: Path) -> None:
     (tmp_path / "sequences" / "00").mkdir(parents=True)
     with pytest.raises(LidarfwError, match="two are needed"):
         tool.sequences_in(str(tmp_path))

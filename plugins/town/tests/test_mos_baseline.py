@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
 from lidarfw_town.generate import Job, generate
 
-TOOL = Path(__file__).parents[3] / "tools" / "mos_baseline.py"
-pytestmark = pytest.mark.skipif(not TOOL.is_file(), reason="the tools are in the repository only")
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mos_baseline", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["mos_baseline"] = module
-    spec.loader.exec_module(module)
-    return module
+tool = pytest.importorskip("mos_baseline", reason="the tools are in the repository only")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +19,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> str:
     return root
 
 
-def test_tally_golden(tool: ModuleType) -> None:
+def test_tally_golden() -> None:
     """Five points, two past scans; the third point moves and both see it, the fourth moves and one does."""
     whole = tool.Tally(2)
     residual = np.array([[0.0, 0.3, 0.5, 0.5, 0.0], [0.0, 0.0, 0.4, 0.0, 0.6]], np.float32)
@@ -48,7 +33,7 @@ def test_tally_golden(tool: ModuleType) -> None:
     assert (agreeing, whole.figures(agreeing, best).iou) == (1, 1.0)  # a threshold between 0.3 and 0.5
 
 
-def test_nothing_counted_is_finite(tool: ModuleType) -> None:
+def test_nothing_counted_is_finite() -> None:
     assert tool.Tally(1).figures(1, 10) == tool.Figures(0, 0, 0)
     assert tool.Tally(1).all_movable == tool.Figures(0, 0, 0)
 
@@ -64,7 +49,7 @@ def scan(shift: float) -> tuple[np.ndarray, np.ndarray]:
     return points.astype("<f4"), np.where(post, 254, 50).astype("<u4")
 
 
-def test_a_person_before_a_wall_is_found(tool: ModuleType, tmp_path: Path) -> None:
+def test_a_person_before_a_wall_is_found(tmp_path: Path) -> None:
     folder = tmp_path / "sequences" / "00"
     for name in ("velodyne", "labels"):
         (folder / name).mkdir(parents=True)
@@ -84,7 +69,7 @@ def test_a_person_before_a_wall_is_found(tool: ModuleType, tmp_path: Path) -> No
     assert counted.all_movable == tool.Figures(1.0, 1.0, 1.0)
 
 
-def test_the_town_gives_figures(tool: ModuleType, town: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_town_gives_figures(town: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert tool.main(["--tune", town, "--test", town, "--past", "2"]) == 0
     rule, _, first, second = capsys.readouterr().out.splitlines()
     assert "of 2 past scans" in rule
@@ -93,6 +78,6 @@ def test_the_town_gives_figures(tool: ModuleType, town: str, capsys: pytest.Capt
     assert first.split("|")[-2].split()[-1] == "1.000"  # all that moves is movable
 
 
-def test_too_short_sequences_are_an_error(tool: ModuleType, town: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_too_short_sequences_are_an_error(town: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert tool.main(["--tune", town, "--test", town, "--past", "9"]) == 2
     assert "no sequence has more than 9 scans" in capsys.readouterr().err

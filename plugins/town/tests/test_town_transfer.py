@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import torch
 from lidarfw.errors import ConfigError
 from lidarfw.types import Boxes, FrameMeta, FrameResult, Targets
 
-TOOL = Path(__file__).parents[3] / "tools" / "town_transfer.py"
-pytestmark = [
-    pytest.mark.skipif(not TOOL.is_file(), reason="the tools are in the repository only"),
-    pytest.mark.filterwarnings("ignore:The ``compute`` method"),
-]
-
-
-@pytest.fixture(scope="module")
-def tool() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("town_transfer", TOOL)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["town_transfer"] = module
-    spec.loader.exec_module(module)
-    return module
+tool = pytest.importorskip("town_transfer", reason="the tools are in the repository only")
+pytestmark = pytest.mark.filterwarnings("ignore:The ``compute`` method")
 
 
 def boxes(x: list[float], score: list[float] | None = None) -> Boxes:
@@ -37,7 +20,7 @@ def boxes(x: list[float], score: list[float] | None = None) -> Boxes:
     )
 
 
-def test_curves_golden_and_figure(tool: ModuleType, tmp_path: Path) -> None:
+def test_curves_golden_and_figure(tmp_path: Path) -> None:
     """Cars at 8, 18 and 28 m: two are found, with scores 0.75 and 0.45, and one detection of 0.65 is wrong."""
     truth, found = boxes([8, 18, 28]), boxes([8, 18, 23], [0.75, 0.45, 0.65])
     result = FrameResult(FrameMeta("a", "a"), {"head": found}, targets=Targets(truth))
@@ -52,6 +35,6 @@ def test_curves_golden_and_figure(tool: ModuleType, tmp_path: Path) -> None:
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_results_without_boxes_are_an_error(tool: ModuleType) -> None:
+def test_results_without_boxes_are_an_error() -> None:
     with pytest.raises(ConfigError, match="a detector and labelled frames"):
         tool.measure([FrameResult(FrameMeta("a", "a"), {}, targets=Targets(boxes([1])))], ("Car",))
