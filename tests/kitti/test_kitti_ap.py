@@ -67,6 +67,12 @@ def test_ten_perfect_cars_fill_ten_positions_only():
     assert figures["car_3d_r11_easy"] == pytest.approx(3 / 11)
 
 
+def test_two_cars_and_a_false_detection_between_them():
+    """Two of 41 positions have a threshold, and R40 leaves the first out; on the recall grid AP is 0.8333."""
+    figures = measure([([car(), car(x=10.0)], [car(score=0.9), car(x=5.0, score=0.8), car(x=10.0, score=0.7)])])
+    assert figures["car_3d_r40_easy"] == pytest.approx(0.016667, abs=1e-6)
+
+
 def test_half_the_cars_found():
     """80 objects, 40 found: recall ends at 0.5, so positions 0 .. 20 hold precision 1."""
     frames = many(80, detections=lambda i: [car(score=0.5 + i / 1000)] if i % 2 else [])

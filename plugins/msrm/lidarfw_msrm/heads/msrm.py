@@ -74,7 +74,7 @@ class MSRMHead(Head):
     proposal. `decode` gives the boxes of all stages, for `box_voting`.
 
     The released code that the paper builds on draws new regions before every stage in training, so that attention
-    there joins tokens of different objects. Here it cannot.
+    there joins tokens of different objects. Here it cannot; `lidarfw_msrm.misaligned` does so, to be compared with.
     """
 
     example: ClassVar[dict[str, object]] = {"grid": 3, "channels": 32, "neighbors": 4}
@@ -150,7 +150,7 @@ class MSRMHead(Head):
         ):
             pooled = self._pool(sources, prepared, bev, current, rois.batch)
             tokens.append(encode(pooled))
-            seen = attend(torch.stack(tokens, 1))
+            seen = attend(self._sequence(tokens, rois, targets))
             confidences.append(judge(seen)[:, 0].float() + PartScore.score(maps, current, rois.batch).float())
             residuals.append(correct(seen).float())
             current = refine(residuals[-1], current).detach()
@@ -180,6 +180,10 @@ class MSRMHead(Head):
         overlap, _ = best_overlap(kept.tensor, kept, truth)
         limit = self.foreground[0][kept.label].minimum(self.confident[kept.label, 1])
         return kept[sampled(overlap, limit, kept.batch, kept.batch_size, self.regions)]
+
+    def _sequence(self, tokens: list[Tensor], rois: Boxes, targets: Targets | None) -> Tensor:
+        """(N, T, C): the tokens that stage T attends to, of the same region in every row."""
+        return torch.stack(tokens, 1)
 
     # features
 
