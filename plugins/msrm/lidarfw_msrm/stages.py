@@ -82,11 +82,8 @@ def ways(stages: int) -> dict[str, tuple[int, ...]]:
 
 def detections(stages: Boxes, chosen: tuple[int, ...], regions: int | None = None) -> Boxes:
     """The boxes of the chosen stages, of the best regions, after suppression."""
-    if regions is not None and stages.stage is not None:
-        count = len(stages) // max(int(stages.stage.max()) + 1, 1) if len(stages) else 0
-        stages = stages[torch.arange(len(stages)) % max(count, 1) < regions]
     spec = Spec(Boxes)
-    voted: Boxes = BoxVoting(spec, stages=chosen)(stages)
+    voted: Boxes = BoxVoting(spec, stages=chosen, regions=regions)(stages)
     kept: Boxes = NMS(spec, iou_threshold=FINAL)(voted)
     return kept
 

@@ -97,6 +97,20 @@ def test_regions_vote_apart_in_their_samples() -> None:
     torch.testing.assert_close(found.center[:, 0], torch.tensor([1.5, 21.5, 41.5, 101.5, 121.5]))
 
 
+def test_only_the_best_regions_of_each_sample_vote() -> None:
+    """Three regions in the first sample, two in the second, each in two stages."""
+    batch, stage = torch.tensor([0] * 3 + [1] * 2).repeat(2), torch.tensor([1, 2]).repeat_interleave(5)
+    rows = torch.zeros(10, 7)
+    rows[:, 0], rows[:, 3:6] = 10.0 * torch.arange(5).repeat(2) + stage, 1
+    label = torch.zeros(10, dtype=torch.long)
+    found = Boxes.from_tensor(rows, label, torch.full((10,), 0.5), batch, 2).replace(stage=stage)
+    torch.testing.assert_close(vote(found, regions=1).center[:, 0], torch.tensor([1.5, 31.5]))
+    assert vote(found, regions=2).batch.tolist() == [0, 0, 1, 1]
+    torch.testing.assert_close(vote(found, regions=9).tensor, vote(found).tensor)
+    with pytest.raises(ConfigError, match="at least 1"):
+        vote(found, regions=0)
+
+
 def test_stages_of_different_numbers_are_refused() -> None:
     with pytest.raises(ConfigError, match="mode: cluster"):
         vote(Boxes.cat([stages([1, 2], [0, 0], [0.5, 0.5]), stages([9], [0], [0.5])]))

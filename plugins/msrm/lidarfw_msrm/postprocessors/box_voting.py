@@ -24,6 +24,8 @@ class BoxVoting(PostProcessor):
     order, `stage` says which is which). Mode cluster: the best box and all of its class that overlap it by a 3D IoU
     over `iou_threshold`, then the best of the rest; works after any detector or ensemble. The score is the mean of the
     scores. weights uniform: the plain mean. stages: those that vote; none named, all but stage 0, the proposals.
+    regions: only the first so many of a sample vote, which are those of the best proposals; regions do not see each
+    other, so this is what a head with fewer of them would give.
 
     Yaw is averaged on the circle after every box is turned to the side of the most confident one: boxes that
     stand for the same object may point in opposite ways. Other fields are those of the most confident box.
@@ -36,13 +38,17 @@ class BoxVoting(PostProcessor):
         mode: str = "stage",
         weights: str = "confidence",
         stages: tuple[int, ...] = (),
+        regions: int | None = None,
         iou_threshold: float = 0.5,
     ) -> None:
         super().__init__()
         for name, value, known in (("mode", mode, MODES), ("weights", weights, WEIGHTS)):
             if value not in known:
                 raise ConfigError(f"postprocessor 'box_voting': {name} is one of {', '.join(known)}, not {value!r}")
-        self.mode, self.weights, self.stages, self.iou_threshold = mode, weights, tuple(stages), iou_threshold
+        if regions is not None and regions < 1:
+            raise ConfigError(f"postprocessor 'box_voting': regions is at least 1 or null, which is all, not {regions}")
+        self.mode, self.weights, self.iou_threshold = mode, weights, iou_threshold
+        self.stages, self.regions = tuple(stages), regions
         self.provides = boxes
 
     def forward(self, boxes: Boxes) -> Boxes:
@@ -53,7 +59,7 @@ class BoxVoting(PostProcessor):
             return self._vote(boxes, self._clusters(boxes))
         if boxes.stage is None or len(boxes) == 0:
             return boxes  # of one stage
-        return self._vote(boxes, _regions(boxes))
+        return self._vote(boxes, _regions(boxes, boxes.stage))
 
     def _chosen(self, boxes: Boxes, stage: Tensor) -> Boxes:
         missing = set(self.stages) - set(stage.tolist())
@@ -64,6 +70,8 @@ class BoxVoting(PostProcessor):
                 "  fix: postprocessor.box_voting.stages=[] for all but stage 0, the proposals"
             )
         chosen = torch.isin(stage, stage.new_tensor(self.stages)) if self.stages else stage > 0
+        if self.regions is not None:
+            chosen &= _places(boxes, stage)[0] < self.regions
         return boxes[chosen]
 
     def _clusters(self, boxes: Boxes) -> Tensor:
@@ -108,20 +116,26 @@ def _first_best(score: Tensor, voter: Tensor, count: int) -> Tensor:
     return order[starts[:count]] if len(order) else order
 
 
-def _regions(boxes: Boxes) -> Tensor:
+def _places(boxes: Boxes, stage: Tensor) -> tuple[Tensor, Tensor]:
+    """Place (N,) of each box among those of its sample and stage, and their number (samples, stages)."""
+    stages, number = torch.unique(stage, return_inverse=True)
+    group = boxes.batch * len(stages) + number
+    sizes = group.bincount(minlength=boxes.batch_size * len(stages))
+    order = group.argsort(stable=True)
+    starts = sizes.cumsum(0) - sizes
+    place = torch.empty_like(group)
+    place[order] = torch.arange(len(group), device=group.device) - starts[group[order]]
+    return place, sizes.view(-1, len(stages))
+
+
+def _regions(boxes: Boxes, stage: Tensor) -> Tensor:
     """Region (N,) of each box: its place among the boxes of its sample and stage."""
-    stages, stage = torch.unique(boxes.stage, return_inverse=True)
-    group = boxes.batch * len(stages) + stage
-    sizes = group.bincount(minlength=boxes.batch_size * len(stages)).view(-1, len(stages))
+    place, sizes = _places(boxes, stage)
     if bool((sizes != sizes[:, :1]).any()):
         raise ConfigError(
             "postprocessor 'box_voting' needs as many boxes of every stage\n"
             f"  found, by sample and stage: {sizes.tolist()}\n"
             "  fix: put it before whatever drops boxes: postprocessor=[box_voting,nms], or mode: cluster"
         )
-    order = group.argsort(stable=True)
-    starts = sizes.flatten().cumsum(0) - sizes.flatten()
-    rank = torch.empty_like(group)
-    rank[order] = torch.arange(len(group), device=group.device) - starts[group[order]]
     before: Tensor = sizes[:, 0].cumsum(0) - sizes[:, 0]
-    return rank + before[boxes.batch]
+    return place + before[boxes.batch]
