@@ -65,39 +65,65 @@ class FrameRecord:
         return found
 
     def by_sequence(self) -> dict[str, Figures]:
-        """Figures of every sequence by itself."""
+        """Figures of every sequence by itself, compared with the reference if there is one."""
         rows: dict[str, list[int]] = {}
-        for row, frame in enumerate(self.frames):
-            rows.setdefault(frame.sequence, []).append(row)
-        return {sequence: self.figures(own) for sequence, own in rows.items()}
+        reference = self._reference()
+        for row in sorted(set(range(len(self.frames))) - set(reference)):
+            rows.setdefault(self.frames[row].sequence, []).append(row)
+        return {sequence: self.figures([*reference, *own]) for sequence, own in rows.items()}
+
+    def by_frame(self) -> list[Figures]:
+        """Figures of every frame by itself, compared with the reference if there is one."""
+        base = self._base()
+        return [
+            self._figures({name: [*base[name], states[row]] for name, states in self._states.items()})
+            for row in range(len(self.frames))
+        ]
+
+    def _reference(self) -> list[int]:
+        """Numbers of the frames that others are compared with, such as those of a map."""
+        metrics = self._metrics.values()
+        return [row for row, frame in enumerate(self.frames) if any(metric.is_reference(frame) for metric in metrics)]
+
+    def _base(self) -> dict[str, list[State]]:
+        """What the reference adds to each metric, in one state; nothing where there is none."""
+        rows = self._reference()
+        return {
+            name: [_joined(metric, [self._states[name][row] for row in rows])] if rows else []
+            for name, metric in self._metrics.items()
+        }
+
+    def _blocks(self, length: int) -> list[list[int]]:
+        """Numbers of the frames that are drawn, in blocks."""
+        drawn = sorted(set(range(len(self.frames))) - set(self._reference()))
+        return [[drawn[place] for place in run] for run in blocks([self.frames[row] for row in drawn], length)]
 
     def resampled(self, count: int, block: int) -> list[Figures]:
         """Figures of `count` bootstrap samples of the frames.
 
         A sample draws, with replacement, as many blocks as there are; a block is `block` consecutive frames of one
         sequence, since neighbouring frames err alike. The draws depend on the number of blocks alone, so that samples
-        of two models on the same frames pair up.
+        of two models on the same frames pair up. Frames that others are compared with are in every sample.
         """
-        runs = blocks(self.frames, block)
+        runs, base = self._blocks(block), self._base()
         joined = {
             name: [_joined(metric, [self._states[name][row] for row in run]) for run in runs]
             for name, metric in self._metrics.items()
         }
         return [
-            self._figures({name: [states[place] for place in drawn] for name, states in joined.items()})
+            self._figures({name: [*base[name], *(states[place] for place in drawn)] for name, states in joined.items()})
             for drawn in draws(len(runs), count)
         ]
 
     def to_plain(self, count: int, block: int) -> dict[str, Any]:
         """All of it for a JSON file: figures by key, None where a set of frames has no such figure."""
-        alone = [self.figures([row]) for row in range(len(self.frames))]
         return {
             "figures": {key: _finite(value) for key, value in self.figures().items()},
             "frames": [{"id": frame.id, "sequence": frame.sequence} for frame in self.frames],
-            "by_frame": _columns(alone),
+            "by_frame": _columns(self.by_frame()),
             "by_sequence": {name: _columns([found]) for name, found in self.by_sequence().items()},
             "block": block,
-            "blocks": len(blocks(self.frames, block)),
+            "blocks": len(self._blocks(block)),
             "resampled": _columns(self.resampled(count, block)),
         }
 

@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 
 import torchmetrics
 
+from lidarfw.types import FrameMeta
+
 
 class Metric(torchmetrics.Metric):
     """Streaming figures: `update` takes predictions, targets and meta by the wiring rules; `compute` a dict of floats.
@@ -18,3 +20,7 @@ class Metric(torchmetrics.Metric):
     full_state_update = False
     monitor: ClassVar[str]
     example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
+
+    def is_reference(self, frame: FrameMeta) -> bool:
+        """Whether other frames are compared with this one, as queries with a map. Every bootstrap sample holds it."""
+        return False

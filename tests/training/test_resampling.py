@@ -13,10 +13,11 @@ from training_runs import settings
 from lidarfw import registry
 from lidarfw.cli import main
 from lidarfw.components.metrics.box_ap import BoxAP
+from lidarfw.components.metrics.recall_at import RecallAt
 from lidarfw.errors import ConfigError
 from lidarfw.resampling import FrameRecord, blocks, draws, interval
 from lidarfw.training import evaluate, train
-from lidarfw.types import Boxes, FrameMeta, FrameResult, Spec, Targets
+from lidarfw.types import Boxes, Descriptors, FrameMeta, FrameResult, Poses, Spec, Targets
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 
@@ -96,6 +97,39 @@ def test_average_precision_of_a_sample_is_computed_anew():
     assert samples[7] == pytest.approx(record.figures(rows))
     assert len({sample["box_ap/mean_3d_ap"] for sample in samples}) > 10
     assert record.by_sequence()["1"] == pytest.approx(record.figures(range(9, 17)))
+
+
+class PlaceModel:
+    """A model whose only metric asks a map, sequence 0, where the frames of the others were taken."""
+
+    def __init__(self) -> None:
+        self.metrics = {"recall_at": RecallAt(Spec(Descriptors, 2), map_sequences=["0"])}
+
+    def update_metrics(self, results, metrics=None) -> None:
+        for result in results:
+            vector, poses = result.predictions["head.toy"], result.targets
+            (metrics or self.metrics)["recall_at"].update(vector, poses, [result.meta])
+
+
+def test_a_map_is_in_every_sample():
+    """Queries are drawn, and what they are compared with stays: else a right answer would lack its place."""
+    model, record, frames = PlaceModel(), FrameRecord(), metas(8, 6, 4)
+    record.start(model)
+    for number, meta in enumerate(frames):
+        place = 50.0 * (meta.index if number != 10 else 7)
+        matrix = torch.eye(4)[None].clone()
+        matrix[0, 0, 3] = 50.0 * meta.index
+        targets = Targets(poses=Poses(matrix, torch.tensor([True]), torch.ones(1)))
+        vector = Descriptors(torch.tensor([[place, 0.0]]), ())
+        record.add([FrameResult(meta, {"head.toy": vector}, None, targets)])
+    found = record.to_plain(40, 1)
+    assert found["figures"]["recall_at/recall@1"] == pytest.approx(0.9)
+    assert (found["blocks"], set(found["resampled"]["recall_at/queries"])) == (10, {10})
+    assert sum(found["by_frame"]["recall_at/recall@1"][8:]) == 9
+    assert found["by_frame"]["recall_at/recall@1"][10] == 0
+    assert {name: alone["recall_at/queries"] for name, alone in found["by_sequence"].items()} == {"1": [6], "2": [4]}
+    shares = found["resampled"]["recall_at/recall@1"]
+    assert sum(shares) / 40 == pytest.approx(0.9, abs=0.06)
 
 
 def test_a_record_of_no_frames_is_finite():

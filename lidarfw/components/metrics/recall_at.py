@@ -26,9 +26,10 @@ class PlaceMetric(Metric):
     vectors: list[Tensor]  # (F, D)
     places: list[Tensor]  # (F, 6) sequence, time, x, y, z in the map, 1 for camera and 0 for others
 
-    def __init__(self, descriptors: Spec) -> None:
+    def __init__(self, descriptors: Spec, map_sequences: Sequence[str] = ()) -> None:
         super().__init__()
         self.channels = descriptors.channels
+        self.map = [sequence_number(str(name)) for name in map_sequences]
         self.add_state("vectors", default=[], dist_reduce_fx="cat")
         self.add_state("places", default=[], dist_reduce_fx="cat")
         self._start()
@@ -56,6 +57,10 @@ class PlaceMetric(Metric):
         position = targets.poses.matrix[:, :3, 3].double().to(self.device)
         self.vectors.append(descriptors.vector.detach().float().to(self.device)[known])
         self.places.append(torch.cat([where[:, :2], position, where[:, 2:]], 1)[known])
+
+    def is_reference(self, frame: FrameMeta) -> bool:
+        """Whether it is of the map, if sequences are named that are."""
+        return sequence_number(frame.sequence) in self.map
 
     def gathered(self) -> tuple[Tensor, Tensor]:
         """Descriptors (F, D) and places (F, 6) of all frames; after an exchange the states are tensors, not lists."""
@@ -109,11 +114,10 @@ class RecallAt(PlaceMetric):
         gap: float = 30.0,
         revisits_only: bool = True,
     ) -> None:
-        super().__init__(descriptors)
+        super().__init__(descriptors, map_sequences)
         if not radii or min(*radii, *counts, 1) <= 0:
             raise ConfigError(f"metric.recall_at: radii and counts must be above 0, got {radii} and {counts}")
         self.radii, self.counts = list(radii), sorted({1, *counts})
-        self.map = [sequence_number(str(name)) for name in map_sequences]
         self.gap, self.revisits_only = gap, revisits_only
 
     def compute(self) -> dict[str, Any]:

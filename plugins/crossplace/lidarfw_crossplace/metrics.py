@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 import torch
 from lidarfw.components.metrics.recall_at import PlaceMetric, precision_recall, rank_of_first
-from lidarfw.components.metrics.sequence import sequence_number
 from lidarfw.errors import ConfigError
 from lidarfw.types import Spec
 from torch import Tensor
@@ -49,14 +48,13 @@ class PlaceRecall(PlaceMetric):
         apart: float = 0.0,
         exclude_hopeless: bool = False,
     ) -> None:
-        super().__init__(descriptors)
+        super().__init__(descriptors, map_sequences)
         if not radii or min(*radii, *counts, spacing) <= 0 or apart < 0:
             raise ConfigError(
                 f"metric.place_recall: radii, counts and spacing must be above 0 and apart at least 0, "
                 f"got {list(radii)}, {list(counts)}, {spacing} and {apart}"
             )
         self.radii, self.counts = list(radii), sorted({1, *counts})
-        self.map = [sequence_number(str(name)) for name in map_sequences]
         self.spacing, self.apart, self.exclude_hopeless = spacing, apart, exclude_hopeless
 
     def compute(self) -> dict[str, Any]:
