@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lidarfw.components.metrics.box_recall import BoxRecall
+from lidarfw.components.metrics.box_recall import KINDS, BoxRecall, f1_score
 from lidarfw.errors import ConfigError
 from lidarfw.types import Boxes, Spec, Targets
 
@@ -34,9 +34,16 @@ def test_golden() -> None:
     assert found["car_objects"] == 3
     assert found["car_bev_recall"] == pytest.approx(2 / 3)
     assert found["car_bev_precision"] == pytest.approx(2 / 3)
-    assert found["mean_3d_recall"] == pytest.approx(2 / 3)
+    assert found["mean_3d_recall"] == found["mean_3d_f1"] == pytest.approx(2 / 3)
     strict = figures((boxes_of([5, 13], [0.9, 0.8]), Targets(truth)), iou={"Car": 0.7})
     assert (strict["car_bev_recall"], strict["car_bev_precision"]) == (pytest.approx(1 / 3), 0.5)
+    assert strict["car_bev_f1"] == pytest.approx(0.4)
+
+
+def test_f1_golden() -> None:
+    """Table IX of the MSRM paper: precision 82.40, recall 84.70."""
+    assert f1_score(82.40, 84.70) == pytest.approx(83.534, abs=1e-3)
+    assert f1_score(0.0, 0.0) == 0
 
 
 def test_far_and_hidden_objects_are_ignored() -> None:
@@ -63,7 +70,7 @@ def test_ignored_objects_of_the_data_stay_ignored() -> None:
 
 @pytest.mark.parametrize("boxes", [Boxes.empty(), boxes_of([0.0], [0.9])])
 def test_nothing_to_find_is_finite(boxes: Boxes) -> None:
-    zero = {f"mean_{measure}_{kind}": 0.0 for measure in ("3d", "bev") for kind in ("recall", "precision")}
+    zero = {f"mean_{measure}_{kind}": 0.0 for measure in ("3d", "bev") for kind in KINDS}
     assert figures() == zero
     assert figures((boxes, Targets(Boxes.empty()))) == zero
 

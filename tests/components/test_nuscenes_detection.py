@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from lidarfw.components.metrics.nuscenes_detection import ERRORS, NuscenesDetection, average_precision, mean_error
+from lidarfw.components.metrics.nuscenes_detection import (
+    ERRORS,
+    NuscenesDetection,
+    average_precision,
+    detection_score,
+    mean_error,
+)
 from lidarfw.errors import ConfigError
 from lidarfw.types import Boxes, Spec, Targets
 
@@ -61,8 +67,14 @@ def test_average_precision_golden() -> None:
     """Precision 1 up to recall 0.5, then 0.5 up to recall 1: (39 * 0.9 + 1 * .9 + 50 * 0.4) / 90 / 0.9."""
     precision = np.where(np.arange(101) <= 50, 1.0, 0.5)
     assert average_precision(precision) == pytest.approx((40 * 0.9 + 50 * 0.4) / 90 / 0.9)
+    assert average_precision(np.full(101, 0.55)) == pytest.approx(0.5)
     assert average_precision(np.full(101, 0.1)) == 0
     assert average_precision(np.full(101, 0.05)) == 0
+
+
+def test_detection_score_golden() -> None:
+    assert detection_score(0.662, [0.3, 0.25, 0.35, 0.25, 0.15]) == pytest.approx(0.701)
+    assert detection_score(0.0, [2.0, 1.0, 1.0, 1.0, 1.0]) == 0
 
 
 def test_mean_error_golden() -> None:

@@ -11,17 +11,19 @@ from lidarfw.components.metrics.box_ap import FALSE, IGNORED, MEASURES, TRUE, Bo
 from lidarfw.components.per_class import per_class
 from lidarfw.types import Boxes, Spec, Targets
 
+KINDS = ("recall", "precision", "f1")
+
 
 class BoxRecall(BoxAP):
-    """Recall and precision of rotated boxes, by 3D and bird's-eye-view IoU, at one score.
+    """Recall, precision and F1 of rotated boxes, by 3D and bird's-eye-view IoU, at one score.
 
     Asked for are the objects whose centre is at most `max_range` metres away and of which the labels say at most
     `max_occlusion` and `max_truncation` (where they say it). All others are ignored, and so is a detection beyond
     `max_range` that matches nothing. Detections below `min_score` are left out. Matching is that of `box_ap`; `iou`
     gives thresholds by class name, `default_iou` that of the others.
 
-    `compute` gives `{class}_{3d,bev}_recall` and `{class}_{3d,bev}_precision` of the classes with an object, and
-    `mean_{3d,bev}_{recall,precision}` (0 without any object), all 0..1, and `{class}_objects`, their number.
+    `compute` gives `{class}_{3d,bev}_{recall,precision,f1}` of the classes with an object, and
+    `mean_{3d,bev}_{recall,precision,f1}` (0 without any object), all 0..1, and `{class}_objects`, their number.
     Raises ConfigError for a class in `iou` that the data does not have.
     """
 
@@ -69,15 +71,12 @@ class BoxRecall(BoxAP):
         asked = {name: int(count) for name, count in zip(self.classes, self.objects) if count}
         figures: dict[str, float] = {f"{_key(name)}_objects": float(count) for name, count in asked.items()}
         for column, measure in enumerate(MEASURES, 2):
-            for kind in ("recall", "precision"):
-                found = {}
-                for name, count in asked.items():
-                    verdict = rows[rows[:, 0] == self.classes.index(name), column]
-                    right, wrong = int((verdict == TRUE).sum()), int((verdict == FALSE).sum())
-                    found[f"{_key(name)}_{measure}_{kind}"] = right / (
-                        count if kind == "recall" else max(right + wrong, 1)
-                    )
-                figures |= found | {f"mean_{measure}_{kind}": sum(found.values()) / max(len(found), 1)}
+            found = [
+                _rates(rows[rows[:, 0] == self.classes.index(name), column], count) for name, count in asked.items()
+            ]
+            for place, kind in enumerate(KINDS):
+                figures |= {f"{_key(name)}_{measure}_{kind}": rates[place] for name, rates in zip(asked, found)}
+                figures[f"mean_{measure}_{kind}"] = sum(rates[place] for rates in found) / max(len(found), 1)
         return figures
 
 
@@ -89,3 +88,15 @@ def _range(boxes: Boxes) -> Tensor:
     """Metres (N,) on the level from the sensor."""
     distance: Tensor = boxes.center[:, :2].norm(dim=1)
     return distance
+
+
+def _rates(verdict: Tensor, objects: int) -> tuple[float, float, float]:
+    """Recall, precision and F1 of detections with these verdicts, of so many objects."""
+    right, wrong = int((verdict == TRUE).sum()), int((verdict == FALSE).sum())
+    recall, precision = right / objects, right / max(right + wrong, 1)
+    return recall, precision, f1_score(precision, recall)
+
+
+def f1_score(precision: float, recall: float) -> float:
+    """Their harmonic mean; 0 where both are 0."""
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0

@@ -8,6 +8,7 @@ implementation.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -163,8 +164,13 @@ class NuscenesDetection(Metric):
         }
         ap = _mean([own["ap"] for own in found.values()], 0.0)
         errors = {f"m{key}": _mean([own[key] for own in found.values() if key in own], 1.0) for key in ERRORS}
-        good = sum(1 - min(1.0, error) for error in errors.values())
-        return {**figures, "map": ap, **errors, "nds": (len(ERRORS) * ap + good) / (2 * len(ERRORS))}
+        return {**figures, "map": ap, **errors, "nds": detection_score(ap, list(errors.values()))}
+
+
+def detection_score(ap: float, errors: Sequence[float]) -> float:
+    """NDS of a mean AP and the mean errors: the AP counts as much as all errors together."""
+    good: float = sum(1 - min(1.0, error) for error in errors)
+    return (len(errors) * ap + good) / (2 * len(errors))
 
 
 def _mean(values: list[float], default: float) -> float:
