@@ -107,7 +107,7 @@ class Aggregation(nn.Module):
         """The same where the normalisation is fixed, A x + b: relu(max(t_v + A x_v) - A x_g + b), since A x_g and b are
         the same for all neighbours. Nothing is left to do for each pair but to take the maximum."""
         norm = self.offset_norm
-        gain = norm.weight / (norm.running_var + norm.eps).sqrt()  # type: ignore[operator]
+        gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)  # type: ignore[operator, arg-type]
         turn = self.offset.weight * gain[:, None]
         here = transformed + _product(sites.xyz, turn)
         highest = scatter_max(here[site], query, len(xyz))
