@@ -40,11 +40,13 @@ class Index(Record):
     @classmethod
     def load(cls, path: str | Path) -> Index:
         """Read what `save` wrote. DataError names what is wrong with the file; it can hold no code."""
+        if not Path(path).is_file():
+            raise DataError(f"there is no map {path}.\n  fix: make one with lidarfw index build CKPT SCAN... -o {path}")
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in ("format", *_ROWS)}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} is no index of a map: {error}.\n  fix: write it again with Index.save") from error
+            raise DataError(f"{path} is no index of a map: {error}.\n  fix: write it again with lidarfw index build") from error
         _check(path, arrays)
         modality = tuple(str(name) for name in arrays["modality"])
         vector, pose, time = (torch.from_numpy(arrays[name]) for name in ("vector", "pose", "time"))

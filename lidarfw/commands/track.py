@@ -18,6 +18,11 @@ _EXAMPLE = """example:
   lidarfw track det --format kitti --calib calib --poses poses -o results --tracker ab3dmot_kitti
   det/{Car,Pedestrian,Cyclist}/0000.txt -> results/0000.txt
 """
+_EXPECTED = {
+    "kitti": "a folder DETECTIONS/CLASS/SEQUENCE.txt, for example det/Car/0000.txt",
+    "nuscenes": "a detection submission, one JSON file",
+    "json": "a folder of what lidarfw predict wrote",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +70,7 @@ def _read(args: argparse.Namespace) -> tuple[list[DetectedSequence], tuple[str, 
     from lidarfw.errors import DataError
 
     if not args.detections.exists():
-        raise DataError(f"{args.detections}: no such file or folder.")
+        raise DataError(f"there are no detections {args.detections}.\n  {args.format}: {_EXPECTED[args.format]}")
     if args.format == "json":
         sequence, classes = detections.read_json(args.detections)
         return [sequence], classes, {}

@@ -151,6 +151,11 @@ def test_broken_index_files_are_named(tmp_path: Path) -> None:
             Index.load(path)
 
 
+def test_a_map_that_is_not_there_is_not_called_broken(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"there is no map .*none\.npz\.\n  fix: make one with lidarfw index build"):
+        Index.load(tmp_path / "none.npz")
+
+
 # --- recall ---------------------------------------------------------------------------------------------------------
 
 
