@@ -46,7 +46,9 @@ class Index(Record):
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in ("format", *_ROWS)}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} is no index of a map: {error}.\n  fix: write it again with lidarfw index build") from error
+            raise DataError(
+                f"{path} is no index of a map: {error}.\n  fix: write it again with lidarfw index build"
+            ) from error
         _check(path, arrays)
         modality = tuple(str(name) for name in arrays["modality"])
         vector, pose, time = (torch.from_numpy(arrays[name]) for name in ("vector", "pose", "time"))

@@ -102,3 +102,31 @@ def test_pairs_are_of_both_sensors_in_half_of_the_cases() -> None:
     assert (first != second).mean() == pytest.approx(0.5, abs=0.06)
     with pytest.raises(ConfigError, match="do not fit 'synthetic'"):
         EitherSensor(of="synthetic", options={"colour": 1})
+
+
+def test_one_network_reads_one_map_or_all_of_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", "experiment=crossplace_town_one"]) == 0
+    alone = capsys.readouterr().out
+    assert "image <- data.depth" in alone
+    assert "data.semantics" not in alone
+    early = [
+        "transform.panorama.stack=true",
+        "transform.panorama.maps=[intensity,depth,semantics]",
+        "head.place.channels=384",
+    ]
+    assert main(["show", "experiment=crossplace_town_one", *early]) == 0
+    stacked = capsys.readouterr().out
+    assert "Image 5ch" in stacked
+    assert "image <- data.panorama" in stacked
+    assert "Descriptors 384ch" in stacked
+    assert "descriptors <- head.place" in stacked
+
+
+def test_branches_and_fusions_are_judged_by_one_training(capsys: pytest.CaptureFixture[str]) -> None:
+    added = "{type: late_fusion, fusion: add, inputs: {parts: [head.intensity, head.depth, head.semantics]}}"
+    for name, width in (("added", 128), ("fused", 384), ("depth", 128)):
+        wanted = f"metric.place_recall.inputs.descriptors=head.{name}"
+        assert main(["show", "experiment=crossplace_town", f"+head.added={added}", wanted]) == 0
+        rows = {row.split()[0]: row for row in capsys.readouterr().out.splitlines() if row}
+        assert f"descriptors <- head.{name}" in rows["metric.place_recall"]
+        assert f"Descriptors {width}ch" in rows[f"head.{name}"]
