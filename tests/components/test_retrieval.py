@@ -39,6 +39,20 @@ def test_every_place_finds_itself_first(chunk: int) -> None:
         matches = retriever.query(index, Descriptors(vector), k)
         assert matches.index[:, 0].tolist() == list(range(100))
         assert matches.distance[:, 0].tolist() == [0.0] * 100
+        alone = [retriever.query(index, Descriptors(row[None]), k) for row in vector]
+        assert [int(match.index[0, 0]) for match in alone] == list(range(100))
+        assert {float(match.distance[0, 0]) for match in alone} == {0.0}
+
+
+@pytest.mark.parametrize("count", [1, 16, 17])
+def test_few_and_many_queries_find_the_same(count: int) -> None:
+    vector, queries = unit(500), unit(count, seed=1)
+    retriever = ExactRetriever(chunk=128)
+    index = retriever.build(Descriptors(vector), poses_of(500))
+    matches = retriever.query(index, Descriptors(queries), 5)
+    expected = (queries[:, None].double() - vector.double()).norm(dim=2).sort(1)
+    assert matches.index.equal(expected.indices[:, :5])
+    torch.testing.assert_close(matches.distance.double(), expected.values[:, :5], atol=1e-6, rtol=0)
 
 
 def test_search_equals_sorting_all_distances() -> None:

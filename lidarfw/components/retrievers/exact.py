@@ -11,13 +11,15 @@ from lidarfw.retrieval import Index
 from lidarfw.types import Descriptors, Matches, Poses
 
 QUERIES = 1024  # at a time
+FEW = 16  # queries, up to which differences are faster than inner products
 
 
 class ExactRetriever(Retriever):
     """Compare every query with every place of the map by L2 distance, `chunk` places at a time.
 
-    The search runs in float64, since the formula by inner products cancels for near neighbours: a descriptor finds
-    itself, at distance 0, also among near copies. Raises DataError for descriptors that are not finite and
+    Many queries at once go by inner products, in float64 since that formula cancels for near neighbours; a few by
+    differences, which reads the map once and copies nothing. A descriptor finds itself, at distance 0, also among near
+    copies. Raises DataError for descriptors that are not finite and
     ConfigError for a query of another width than the map.
     """
 
@@ -69,14 +71,21 @@ class ExactRetriever(Retriever):
         best = torch.full((len(vector), k), torch.inf, dtype=torch.float64, device=vector.device)
         rows = torch.full(best.shape, -1, dtype=torch.long, device=vector.device)
         for start in range(0, len(index), self.chunk):
-            part = index.vector[start : start + self.chunk].double()
-            distance = torch.cdist(vector.double(), part, compute_mode="use_mm_for_euclid_dist")
+            part = index.vector[start : start + self.chunk]
+            distance = _distances(vector, part)
             number = torch.arange(start, start + len(part), device=rows.device).expand(len(vector), -1)
             best, order = torch.cat([best, distance], 1).topk(k, dim=1, largest=False)
             rows = torch.cat([rows, number], 1).gather(1, order)
         exact = (vector[:, None] - index.vector[rows]).norm(dim=2) if len(index) else best.float()
         exact, order = torch.where(rows >= 0, exact, torch.inf).sort(stable=True, dim=1)
         return rows.gather(1, order), exact
+
+
+def _distances(vector: Tensor, part: Tensor) -> Tensor:
+    """(Q, N) in float64."""
+    if len(vector) <= FEW:
+        return torch.cdist(vector.float(), part.float(), compute_mode="donot_use_mm_for_euclid_dist").double()
+    return torch.cdist(vector.double(), part.double(), compute_mode="use_mm_for_euclid_dist")
 
 
 def _finite(descriptors: Descriptors, what: str) -> Tensor:
