@@ -144,6 +144,14 @@ def test_what_cannot_be_is_refused(scans: Path, tmp_path: Path, capsys, changes,
     assert text in capsys.readouterr().err
 
 
+def test_a_damaged_checkpoint_is_refused_before_the_folder_is_begun(scans: Path, tmp_path: Path, capsys) -> None:
+    damaged = tmp_path / "damaged.ckpt"
+    damaged.write_text("junk")
+    assert main(["pseudo-label", str(tmp_path / "out"), *overrides(scans), "--start", str(damaged)]) == 2
+    assert "damaged.ckpt cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_model_that_is_never_sure_says_how_sure_it_was(scans: Path, tmp_path: Path, capsys) -> None:
     command = ["pseudo-label", str(tmp_path), *overrides(scans), "--rounds", "1", "--keep"]
     assert main([*command, "Car=1.0", "Pedestrian=1.0", "Cyclist=1.0"]) == 2

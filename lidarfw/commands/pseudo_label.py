@@ -38,8 +38,11 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--rounds is a number of rounds, got {args.rounds}")
     if args.start:
         require_checkpoint(args.start)
+    from lidarfw import checkpoint
     from lidarfw.pseudo_labels import Loop, Settings
 
+    if args.start:
+        checkpoint.verify(args.start)  # before the folder is begun with it
     loop = Loop(args.folder, Settings(tuple(args.overrides), args.start, keep, args.ignore))
     found = []
     for one in loop.run(args.rounds):
