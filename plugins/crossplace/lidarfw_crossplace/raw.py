@@ -54,8 +54,9 @@ def main() -> None:
         return frame
 
     width = raw_descriptor(changed(0)).shape[1]
-    options = OmegaConf.to_container(settings.metric.place_recall, resolve=True)
-    metric = PlaceRecall(Spec(Descriptors, width), **options)  # type: ignore[arg-type]
+    chosen = dict(OmegaConf.to_container(settings.metric.place_recall, resolve=True))  # type: ignore[arg-type]
+    options = {key: value for key, value in chosen.items() if key not in ("type", "inputs")}
+    metric = PlaceRecall(Spec(Descriptors, width), **options)
     for name, value in judged((changed(i) for i in track(range(len(dataset)), "read")), metric).items():
         print(f"{name:<24} {value:.4f}")
 

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lidarfw import config
 from lidarfw.cli import main
+from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.data import PairOrder
 from lidarfw.errors import ConfigError, DataError
 
@@ -130,3 +132,11 @@ def test_branches_and_fusions_are_judged_by_one_training(capsys: pytest.CaptureF
         rows = {row.split()[0]: row for row in capsys.readouterr().out.splitlines() if row}
         assert f"descriptors <- head.{name}" in rows["metric.place_recall"]
         assert f"Descriptors {width}ch" in rows[f"head.{name}"]
+
+
+@pytest.mark.parametrize("name", ["crossplace_town", "crossplace_town_one"])
+def test_another_drive_queries_the_map_of_the_town(name: str) -> None:
+    settings = config.compose([f"experiment={name}"])
+    for stage in ("val", "test"):
+        drives = Kitti360Dataset.splits[settings.splits[stage]]
+        assert set(settings.metric.place_recall.map_sequences) < set(drives)
