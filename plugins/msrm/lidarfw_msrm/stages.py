@@ -59,6 +59,8 @@ LOOSE = {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}
 FINAL = 0.1  # IoU of the suppression
 SHOWN = 3  # objects of a frame in a picture
 AROUND = 4.0  # metres around an object
+GROUND = 0.25  # metres over the foot of an object
+TRUTH, FOUND = "#0072B2", "#D55E00"
 
 
 Metrics = dict[str, Metric]  # by the prefix of their figures
@@ -189,33 +191,35 @@ def draw(path: Path, one: Seen, stages: int) -> bool:
     rows = [row for row in overlap.argsort(descending=True).tolist() if overlap[row] > 0][:SHOWN]
     if not rows:
         return False
-    figure = Figure((2.6 * len(found), 2.8 * len(rows)), dpi=90, facecolor="white", layout="constrained")
+    figure = Figure((2.3 * len(found), 2.5 * len(rows) + 0.7), dpi=110, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(len(rows), len(found), squeeze=False)
     for line, row in zip(panels, rows, strict=True):
         for axes, (name, boxes) in zip(line, found.items(), strict=True):
             _panel(axes, one.points, truth[row : row + 1], boxes, name)
-    figure.suptitle(one.meta.id)
+    figure.suptitle(f"{one.meta.id}, from above, {2 * AROUND:.0f} m wide; grey: points on the ground", fontsize=9)
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
     return True
 
 
 def _panel(axes: Axes, points: Points, truth: Boxes, boxes: Boxes, name: str) -> None:
-    """One object from above: points, truth in black, the box of its class that overlaps it most in red."""
+    """One object from above: points, truth, the box of its class that overlaps it most."""
     boxes = boxes[boxes.label == truth.label]
     x, y = truth.center[0, :2].tolist()
-    axes.scatter(points.xyz[:, 0], points.xyz[:, 1], s=4, c="#888888", linewidths=0)
+    near = (points.xyz[:, :2] - truth.center[:, :2]).abs().amax(1) <= AROUND
+    ground = float(truth.center[0, 2] - truth.size[0, 2] / 2) + GROUND
+    for above, colour in ((False, "#C8C8C8"), (True, "#303030")):
+        shown = points.xyz[near & ((points.xyz[:, 2] > ground) == above)]
+        axes.scatter(shown[:, 0], shown[:, 1], s=3, c=colour, linewidths=0, label="points" if above else None)
     axes.set(xlim=(x - AROUND, x + AROUND), ylim=(y - AROUND, y + AROUND), aspect="equal", xticks=[], yticks=[])
-    axes.plot(*_outline(truth.tensor), color="black", linewidth=1.2, linestyle="--")
-    value = 0.0
-    if len(boxes):
-        overlap = iou_3d(truth.tensor, boxes.tensor)[0]
-        best = int(overlap.argmax())
-        value = float(overlap[best])
-        if value > 0:
-            axes.plot(*_outline(boxes.tensor[best : best + 1]), color="#D55E00", linewidth=1.5)
-    axes.set_title(f"{name}: IoU {value:.2f}", fontsize=9)
+    axes.plot(*_outline(truth.tensor), color=TRUTH, linewidth=1.6, linestyle="--", label="labelled")
+    overlap = iou_3d(truth.tensor, boxes.tensor)[0] if len(boxes) else truth.yaw.new_zeros(1)
+    best = int(overlap.argmax())
+    if overlap[best] > 0:
+        axes.plot(*_outline(boxes.tensor[best : best + 1]), color=FOUND, linewidth=1.8, label="found")
+    axes.set_title(f"{name}: IoU {float(overlap[best]):.2f}", fontsize=9)
 
 
 def _outline(box: torch.Tensor) -> tuple[list[float], list[float]]:
