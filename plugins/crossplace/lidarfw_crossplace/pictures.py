@@ -1,7 +1,8 @@
 """Look at what a model finds again: python -m lidarfw_crossplace.pictures CKPT --split test -o pictures.
 
 Writes map.png, the drive with queries that were answered rightly and wrongly; precision_recall.png; and matches.png, in
-rows: a query, the place that was found, and the nearest true one, wrong answers first.
+rows: a query, the place that was found, and the nearest true one, wrong answers first; sensors.png, where frames are
+there by camera and LiDAR, both panoramas of the same moment one above the other.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import torch
 from lidarfw.components.metrics.recall_at import precision_recall
 from lidarfw.draw import COLOURS, Picture, write_png
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.types import BEV, Descriptors, FrameMeta, Image, Record
+from lidarfw.types import BEV, Descriptors, FrameMeta, FrameResult, Image, Record
 from torch import Tensor
 
 from lidarfw_crossplace.metrics import DIRECTIONS
@@ -33,7 +34,9 @@ class Answers:
     query: Tensor  # (Q,) number of the frame
     found: Tensor  # (Q,) number of the place found
     true: Tensor  # (Q,) number of the nearest place
-    distance: Tensor  # (Q,) of descriptors
+    distance: Tensor  # (Q,) of descriptors, to the place found
+    true_distance: Tensor  # (Q,) to the nearest place
+    off: Tensor  # (Q,) metres from the query to the place found
     right: Tensor  # (Q,) bool
 
 
@@ -50,12 +53,11 @@ def answers(vectors: Tensor, places: Tensor, searched: Tensor, radius: float) ->
         apart = torch.cdist(vectors[part].double(), vectors.double()).masked_fill(~allowed, torch.inf)
         best, found = apart.min(1)
         least, true = metres.min(1)
-        hit = metres.gather(1, found[:, None])[:, 0] <= radius
+        off = metres.gather(1, found[:, None])[:, 0]
         number = torch.arange(start, start + len(best))
-        asked = least <= radius
-        rows.append([column[asked] for column in (number, found, true, best, hit)])
-    query, found, true, distance, right = (torch.cat(column) for column in zip(*rows, strict=True))
-    return Answers(query, found, true, distance, right)
+        asked, there = least <= radius, apart.gather(1, true[:, None])[:, 0]
+        rows.append([column[asked] for column in (number, found, true, best, there, off, off <= radius)])
+    return Answers(*(torch.cat(column) for column in zip(*rows, strict=True)))
 
 
 def searched_by(metas: Sequence[FrameMeta], apart: float, maps: Sequence[str], direction: str) -> Tensor:
@@ -136,25 +138,60 @@ def picture_of(value: Record) -> Picture:
 
 def examples(found: Answers, inputs: Sequence[dict[str, Record]], metas: Sequence[FrameMeta], rows: int) -> Picture:
     """Query, found and true place beside each other, all inputs of a frame below each other; wrong answers first."""
-    order = torch.argsort(found.right.long(), stable=True)
-    chosen = order[torch.linspace(0, len(order) - 1, min(rows, len(order))).round().long()]
-    wrong = order[: int((~found.right).sum())][: max(rows // 2, 1)]
-    chosen = torch.unique(torch.cat([wrong, chosen]), sorted=False)
-    chosen = chosen[torch.argsort(found.right[chosen].long(), stable=True)][:rows]
-    tall = next(iter(inputs[0].values()))
-    height = 1.0 * len(inputs[0]) if isinstance(tall, Image) else 2.6
     from matplotlib.figure import Figure
 
-    figure = Figure((11, height * len(chosen) + 0.4), dpi=110, layout="constrained")
-    grid = figure.subplots(len(chosen), 3, squeeze=False)
-    for axes, row in zip(grid, chosen.tolist(), strict=True):
-        for place, (cell, numbers) in enumerate(zip(axes, (found.query, found.found, found.true), strict=True)):
+    wrong, right = (~found.right).nonzero()[:, 0], found.right.nonzero()[:, 0]
+    half = max(rows // 2, rows - len(right))
+    chosen = [*_spread(wrong, half), *_spread(right, rows - min(half, len(wrong)))]
+    shape = np.concatenate([picture_of(value) for value in inputs[0].values()]).shape
+    figure = Figure((11, len(chosen) * (11 / 3 * shape[0] / shape[1] + 0.4)), dpi=110, layout="constrained")
+    for axes, row in zip(figure.subplots(len(chosen), 3, squeeze=False), chosen, strict=True):
+        said = f"{found.distance[row]:.3f}, {found.off[row]:.0f} m off", f"{found.true_distance[row]:.3f}"
+        titles = ("query", f"found: distance {said[0]}", f"true place: distance {said[1]}")
+        for cell, title, numbers in zip(axes, titles, (found.query, found.found, found.true), strict=True):
             frame = int(numbers[row])
             cell.imshow(np.concatenate([picture_of(value) for value in inputs[frame].values()]))
-            colour = _RIGHT if found.right[row] else _WRONG
-            what = ("query", "found", "true place")[place]
-            cell.set_title(f"{what}: {metas[frame].id}", fontsize=8, color=colour if place == 1 else "black")
+            colour = (_RIGHT if found.right[row] else _WRONG) if title.startswith("found") else "black"
+            cell.set_title(f"{title}\n{metas[frame].id}", fontsize=8, color=colour)
             cell.set_axis_off()
+    return _rendered(figure)
+
+
+def _spread(numbers: Tensor, count: int) -> list[int]:
+    """At most `count` of the numbers, evenly from first to last."""
+    places = torch.linspace(0, max(len(numbers) - 1, 0), min(count, len(numbers))).round().long()
+    return [int(number) for number in numbers[places]]
+
+
+def both_sensors(
+    vectors: Tensor, inputs: Sequence[dict[str, Record]], metas: Sequence[FrameMeta], rows: int
+) -> Picture | None:
+    """Every map of the same moment by the cameras and, below it, by the LiDAR; None where no frame is there by both.
+
+    The title says how far apart the two descriptors are, and the camera's from the nearest other frame by LiDAR.
+    """
+    from matplotlib.figure import Figure
+
+    frames = {(meta.sequence, meta.index, meta.modality): number for number, meta in enumerate(metas)}
+    lidar = torch.tensor([number for (_, _, kind), number in frames.items() if kind == "lidar"], dtype=torch.long)
+    pairs = [(one, frames[s, i, "lidar"]) for (s, i, kind), one in frames.items()
+             if kind == "camera" and (s, i, "lidar") in frames]  # fmt: skip
+    if not pairs:
+        return None
+    names = list(inputs[0])
+    shape = picture_of(inputs[0][names[0]]).shape
+    figure = Figure((11, rows * (2 * len(names) * 10 * shape[0] / shape[1] + 0.5)), dpi=110, layout="constrained")
+    for part, number in zip(figure.subfigures(rows, 1, squeeze=False)[:, 0], _spread(torch.arange(len(pairs)), rows)):
+        camera, scan = pairs[number]
+        apart = (vectors[lidar] - vectors[camera]).norm(dim=1)
+        same, other = float(apart[lidar == scan]), float(apart[lidar != scan].min()) if len(lidar) > 1 else float("nan")
+        part.suptitle(f"{metas[camera].id}: distance {same:.3f}, nearest other scan {other:.3f}", fontsize=9)
+        cells = part.subplots(2 * len(names), 1, squeeze=False)[:, 0]
+        order = [(name, frame) for name in names for frame in (camera, scan)]
+        for cell, (name, frame) in zip(cells, order, strict=True):
+            cell.imshow(picture_of(inputs[frame][name]))
+            cell.set_ylabel(f"{name}\n{metas[frame].modality}", fontsize=7, rotation=0, ha="right", va="center")
+            cell.set(xticks=[], yticks=[])
     return _rendered(figure)
 
 
@@ -168,9 +205,10 @@ def main() -> None:
     parser.add_argument("--apart", type=float, default=15.05, metavar="S", help="older frames are searched (15.05 s)")
     parser.add_argument("--map", nargs="*", default=[], metavar="SEQ", help="sequences to search, instead of the own")
     parser.add_argument("--direction", choices=list(DIRECTIONS), default="", help="sensors of query and map")
+    parser.add_argument("--head", default="", metavar="NAME", help="whose descriptors, of several: head.fused")
     parser.add_argument("--rows", type=int, default=6, help="of matches.png (%(default)s)")
     args = parser.parse_args()
-    vectors, places, metas, inputs = _described(args.checkpoint, args.split)
+    vectors, places, metas, inputs = _described(args.checkpoint, args.split, args.head)
     found = answers(vectors, places, searched_by(metas, args.apart, args.map, args.direction), args.radius)
     if not len(found.query):
         raise ConfigError(
@@ -179,10 +217,15 @@ def main() -> None:
     write_png(args.output / "map.png", hits_on_map(found, places))
     write_png(args.output / "precision_recall.png", precision_recall_curve(found))
     write_png(args.output / "matches.png", examples(found, inputs, metas, args.rows))
+    both = both_sensors(vectors, inputs, metas, 2)
+    if both is not None:
+        write_png(args.output / "sensors.png", both)
     print(f"{args.output}: {int(found.right.sum())} of {len(found.right)} queries found")
 
 
-def _described(checkpoint: str, split: str) -> tuple[Tensor, Tensor, list[FrameMeta], list[dict[str, Record]]]:
+def _described(
+    checkpoint: str, split: str, head: str
+) -> tuple[Tensor, Tensor, list[FrameMeta], list[dict[str, Record]]]:
     """Descriptors (F, D), places (F, 2), names and inputs of the frames of a split that have a pose."""
     import lidarfw
     from lidarfw import predict
@@ -194,13 +237,21 @@ def _described(checkpoint: str, split: str) -> tuple[Tensor, Tensor, list[FrameM
     for result in predict.predict_frames(model, (frames[i] for i in track(range(len(frames)), "describe"))):
         if result.targets is None or result.targets.poses is None or not bool(result.targets.poses.ok[0]):
             continue
-        vectors.append(result.of(Descriptors).vector)
+        vectors.append(_descriptors(result, head).vector)
         places.append(result.targets.poses.matrix[0, :2, 3])
         metas.append(result.meta)
         inputs.append(dict(result.inputs))
     if not vectors:
         raise DataError(f"split {split!r} has no frame with a pose")
     return torch.cat(vectors), torch.stack(places), metas, inputs
+
+
+def _descriptors(result: FrameResult, head: str) -> Descriptors:
+    """Those of a head, or the only ones."""
+    there = {name: value for name, value in result.predictions.items() if isinstance(value, Descriptors)}
+    if (head and head not in there) or (not head and len(there) != 1):
+        raise ConfigError(f"the model gives descriptors by {', '.join(there) or 'no head'}: choose with --head NAME")
+    return there[head] if head else next(iter(there.values()))
 
 
 if __name__ == "__main__":
