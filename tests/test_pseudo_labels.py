@@ -152,6 +152,13 @@ def test_a_damaged_checkpoint_is_refused_before_the_folder_is_begun(scans: Path,
     assert not (tmp_path / "out").exists()
 
 
+def test_a_file_is_no_folder_for_rounds(scans: Path, tmp_path: Path, capsys) -> None:
+    (tmp_path / "out").write_text("mine")
+    assert main(["pseudo-label", str(tmp_path / "out"), *overrides(scans)]) == 2
+    assert "out is a file; the rounds need a folder" in capsys.readouterr().err
+    assert (tmp_path / "out").read_text() == "mine"
+
+
 def test_a_model_that_is_never_sure_says_how_sure_it_was(scans: Path, tmp_path: Path, capsys) -> None:
     command = ["pseudo-label", str(tmp_path), *overrides(scans), "--rounds", "1", "--keep"]
     assert main([*command, "Car=1.0", "Pedestrian=1.0", "Cyclist=1.0"]) == 2

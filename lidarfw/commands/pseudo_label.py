@@ -36,6 +36,10 @@ def run(args: argparse.Namespace) -> int:
     keep = dict(_score(text) for text in args.keep)
     if args.rounds < 0:
         raise ConfigError(f"--rounds is a number of rounds, got {args.rounds}")
+    if args.folder.exists() and not args.folder.is_dir():
+        raise ConfigError(
+            f"{args.folder} is a file; the rounds need a folder.\n  fix: lidarfw pseudo-label runs/mine ..."
+        )
     if args.start:
         require_checkpoint(args.start)
     from lidarfw import checkpoint
