@@ -80,19 +80,19 @@ class PerceptionModel(nn.Module):
             result = self.component(step)(**arguments, **self._special(step, batch))
             replaced = step.replaces
             predicted[replaced[0].producer if replaced else step.id] = result
-        taps = {name: outputs[name].tap for name in self._tapped()}
-        return [self._result(predicted, taps, batch, number) for number in range(len(batch))]
+        taps = {name: outputs[name].tap for name in self._asked("tap")}
+        hidden = {name: self._decoded(name, outputs) for name in self._asked("value") - final}
+        columns = (predicted, batch.inputs, taps, hidden)
+        return [self._result(batch, number, *columns) for number in range(len(batch))]
 
-    def _tapped(self) -> set[str]:
-        """The heads whose tap a metric asks for."""
+    def _asked(self, item: str) -> set[str]:
+        """The heads whose tap or value a metric asks for."""
         refs = [ref for step in self.plan.of("metric") for taken in step.takes.values() for ref in taken]
-        return {ref.producer for ref in refs if ref.item == "tap"}
+        return {ref.producer for ref in refs if ref.item == item and ref.producer.startswith("head.")}
 
-    def _result(self, predicted: dict[str, Any], taps: dict[str, Any], batch: Batch, number: int) -> FrameResult:
-        predictions = {name: take(value, number) for name, value in predicted.items()}
-        inputs = {name: take(value, number) for name, value in batch.inputs.items()}
-        own = {name: take(tap, number) for name, tap in taps.items()}
-        return FrameResult(batch.meta[number], predictions, None, take(batch.targets, number), inputs, own)
+    def _result(self, batch: Batch, number: int, *columns: dict[str, Any]) -> FrameResult:
+        own = [{name: take(value, number) for name, value in column.items()} for column in columns]
+        return FrameResult(batch.meta[number], own[0], None, take(batch.targets, number), *own[1:])
 
     # wiring at run time
 
@@ -180,7 +180,7 @@ class PerceptionModel(nn.Module):
 
     def _from_result(self, step: Step, result: FrameResult) -> dict[str, Any]:
         found: dict[str, Any] = {f"data.{name}": value for name, value in result.inputs.items()}
-        found |= result.predictions
+        found |= {**result.replaced, **result.predictions}
         found |= {f"{name}.tap": tap for name, tap in result.taps.items()}
         found |= {step.id: result.tracks for step in self.plan.of("tracker")}
         arguments = {p.name: self._argument(step, p, found, found) for p in step.declared.takes}

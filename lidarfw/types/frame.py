@@ -82,6 +82,7 @@ class FrameResult:
     targets: Targets | None = None  # ground truth of the frame in evaluation, for metrics; None at inference
     inputs: dict[str, Any] = field(default_factory=dict)  # what the model saw: "points": Points, ...
     taps: dict[str, BEV] = field(default_factory=dict)  # by head, where a metric asks for Tap(kind)
+    replaced: dict[str, Any] = field(default_factory=dict)  # of heads that a later one replaced, where a metric asks
 
     def of(self, kind: type[T]) -> T:
         """The only prediction of a kind; LookupError where there is none or more than one."""

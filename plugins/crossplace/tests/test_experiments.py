@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import lidarfw
 import numpy as np
 import pytest
-from lidarfw import config
+from lidarfw import config, predict
 from lidarfw.cli import main
 from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.data import PairOrder
 from lidarfw.errors import ConfigError, DataError
+from lidarfw.training import evaluate
 
 from lidarfw_crossplace.datasets import BEVPlaceDataset, EitherSensor
 
@@ -140,3 +142,22 @@ def test_another_drive_queries_the_map_of_the_town(name: str) -> None:
     for stage in ("val", "test"):
         drives = Kitti360Dataset.splits[settings.splits[stage]]
         assert set(settings.metric.place_recall.map_sequences) < set(drives)
+
+
+def test_a_branch_is_judged_though_fusion_replaces_it(tmp_path: Path) -> None:
+    options = (
+        "dataset=either_sensor dataset.either_sensor.of=synthetic +dataset.either_sensor.options={frames:4,image:true} "
+        "transform=panorama transform.panorama.maps=[intensity] transform.panorama.cameras=[image] "
+        "transform.panorama.height=16 transform.panorama.width=64 backbone=cosplace_small "
+        "~neck head=[place_small,late_fusion] head.place.channels=8 +head.late_fusion.inputs={parts:[head.place]} "
+        "loss=tsap metric=place_recall +metric.place_recall.inputs={descriptors:head.late_fusion} loader.batch_size=4 "
+        f"trainer.max_epochs=1 trainer.accelerator=cpu logger=none hydra.run.dir={tmp_path}"
+    )
+    assert main(["train", *options.split()]) == 0
+    checkpoint = next(tmp_path.glob("checkpoints/last*.ckpt"))
+    whole = evaluate(checkpoint)
+    alone = evaluate(checkpoint, ["metric.place_recall.inputs.descriptors=head.place"])
+    assert alone == pytest.approx(whole)  # fused of this branch alone
+    model = lidarfw.load(checkpoint)
+    result = next(iter(predict.predict_frames(model, [predict.SplitFrames(model, "val")[0]])))
+    assert list(result.predictions) == ["head.late_fusion"]
