@@ -88,37 +88,45 @@ class Aggregation(nn.Module):
         self.out = nn.Sequential(nn.Linear(channels, channels, bias=False), BatchNorm1d(channels), nn.ReLU())
 
     def transform(self, sites: Sites) -> Tensor:
-        """(V, C') of all sites; the same for every stage."""
+        """(V, C') of all sites, the same for every stage; where the normalisation is fixed, with A x_v in it."""
         transformed: Tensor = self.feature_norm(self.feature(sites.features))
-        return transformed
+        return transformed if self.training else transformed + _product(sites.xyz, self._fixed()[0])
 
     def forward(self, transformed: Tensor, sites: Sites, xyz: Tensor, pairs: Tensor) -> Tensor:
         """(M, C') of the points xyz (M, 3) with their pairs (P, 2); 0 goes in where a point has no neighbour."""
-        pool = self._pool_pairs if self.training else self._pool_sites
-        pooled: Tensor = self.out(pool(transformed, sites, xyz, *pairs.unbind(1)))
-        return pooled
+        query, site = pairs.unbind(1)
+        if self.training:
+            pooled = self._pool_pairs(transformed, sites, xyz, query, site)
+        else:
+            pooled = self._pool_sites(transformed, xyz, query, site)
+        out: Tensor = self.out(pooled)
+        return out
 
     def _pool_pairs(self, transformed: Tensor, sites: Sites, xyz: Tensor, query: Tensor, site: Tensor) -> Tensor:
         """max over the neighbours v of point g of relu(t_v + norm(W (x_v - x_g))); norm looks at all pairs."""
         offset = self.offset_norm(self.offset(sites.xyz[site] - xyz[query]))
         return scatter_max(torch.relu(transformed[site] + offset), query, len(xyz))
 
-    def _pool_sites(self, transformed: Tensor, sites: Sites, xyz: Tensor, query: Tensor, site: Tensor) -> Tensor:
+    def _pool_sites(self, transformed: Tensor, xyz: Tensor, query: Tensor, site: Tensor) -> Tensor:
         """The same where the normalisation is fixed, A x + b: relu(max(t_v + A x_v) - A x_g + b), since A x_g and b are
         the same for all neighbours. Nothing is left to do for each pair but to take the maximum."""
-        norm = self.offset_norm
-        gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)  # type: ignore[operator, arg-type]
-        turn = self.offset.weight * gain[:, None]
-        here = transformed + _product(sites.xyz, turn)
-        highest = scatter_max(here[site], query, len(xyz))
-        pooled = torch.relu(highest - _product(xyz, turn) + (norm.bias - norm.running_mean * gain))  # type: ignore[operator]
+        weight, bias = self._fixed()
+        highest = scatter_max(transformed[site], query, len(xyz))
+        pooled = torch.relu(highest - _product(xyz, weight) + bias)
         found = torch.zeros(len(xyz), 1, dtype=pooled.dtype, device=pooled.device).index_fill(0, query, 1)
         return pooled * found
+
+    def _fixed(self) -> tuple[Tensor, Tensor]:
+        """A (C', 3) and b (C',) of the offsets, their normalisation by its running statistics folded in."""
+        norm = self.offset_norm
+        gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)  # type: ignore[operator, arg-type]
+        return self.offset.weight * gain[:, None], norm.bias - norm.running_mean * gain  # type: ignore[operator]
 
 
 def _product(xyz: Tensor, weight: Tensor) -> Tensor:
     """(N, C') of (N, 3) and (C', 3), not as a matrix product: at half precision, places would be off by decimetres."""
-    return (xyz[:, :, None] * weight.T).sum(1)
+    x, y, z = xyz[:, :1], xyz[:, 1:2], xyz[:, 2:]
+    return torch.addcmul(torch.addcmul(x * weight[:, 0], y, weight[:, 1]), z, weight[:, 2])
 
 
 class SitePooling(nn.Module):
