@@ -76,8 +76,9 @@ class CueEmbedding(nn.Module):
         super().__init__()
         self.cues = tuple(cue for cue in CUES if cue in cues and (cue != "appearance" or appearance))
         self.embed = nn.ModuleDict({cue: _embedding(cue, classes, appearance, geometry) for cue in self.cues})
+        self.level = nn.ModuleDict({cue: nn.LayerNorm(_wide(cue)) for cue in self.cues})  # no cue drowns another
         self.absent = nn.ParameterDict({c: nn.Parameter(torch.zeros(_SHAPE)) for c in self.cues if c in _OPTIONAL})
-        inputs = sum(_CATEGORY if cue == "category" else _SHAPE for cue in self.cues) + 1
+        inputs = sum(map(_wide, self.cues)) + 1
         self.join = nn.Sequential(
             nn.Linear(inputs, width), nn.ReLU(), nn.LayerNorm(width), nn.Linear(width, width), nn.ReLU(),
             nn.LayerNorm(width),
@@ -96,7 +97,8 @@ class CueEmbedding(nn.Module):
             "category": nn.functional.one_hot(label, self.classes).to(boxes.dtype),
         }
         there = {"box2d": box2d is not None, "appearance": appearance is not None}
-        parts = [self._or_absent(self.embed[cue](known[cue]), cue, there.get(cue, True)) for cue in self.cues]
+        told = {cue: self.level[cue](self.embed[cue](known[cue])) for cue in self.cues}
+        parts = [self._or_absent(told[cue], cue, there.get(cue, True)) for cue in self.cues]
         result: Tensor = self.join(torch.cat([*parts, score[..., None]], -1))
         return result
 
@@ -120,10 +122,15 @@ class CueEmbedding(nn.Module):
         return torch.where(there[:, None, None], cue, self.absent[name])
 
 
+def _wide(cue: str) -> int:
+    """The width of the embedding of a cue."""
+    return _CATEGORY if cue == "category" else _SHAPE
+
+
 def _embedding(cue: str, classes: int, appearance: int, geometry: str) -> nn.Module:
     """The network of one cue."""
     if cue == "category":
-        return nn.Linear(classes, _CATEGORY)
+        return nn.Linear(classes, _wide(cue))
     if cue == "appearance":
         return nn.Sequential(nn.LayerNorm(appearance), nn.Linear(appearance, _SHAPE))
     corners, numbers = (8, 3 + 6 * len(_WAVES)) if cue == "box3d" else (4, 2)
@@ -202,6 +209,22 @@ class TemporalFlow(nn.Module):
         for parameter in self.refine[-1].parameters():
             nn.init.zeros_(parameter)  # refinement starts at none
         self.heads, self.gathers = heads, kind == "attention"
+        self._start_as_similarity()
+
+    def _start_as_similarity(self) -> None:
+        """Equal queries and keys, and logits that rise with every head's product, so that like boxes have high ones.
+
+        From two random maps the network learns the few objects of its training drives by heart instead. Half of the
+        hidden units see the products negated, and are taken away, as positive ones alone would cut off what is unlike.
+        """
+        self.key.load_state_dict(self.query.state_dict())
+        (first, first_bias), (last, _) = (layer.parameters() for layer in (self.combine[0], self.combine[-1]))
+        sign = torch.ones(len(first))
+        sign[1::2] = -1
+        with torch.no_grad():
+            first.abs_().mul_(sign[:, None])
+            last.abs_().mul_(sign)
+            first_bias.zero_()
 
     def forward(
         self, past: Tensor, now: Tensor, past_mask: Tensor, now_mask: Tensor, seconds: Tensor

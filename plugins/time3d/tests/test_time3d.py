@@ -134,6 +134,15 @@ def test_products_of_attention_h10() -> None:
     np.testing.assert_allclose(product.softmax(1).detach(), [[0.5, 0.5], [0.3302385, 0.6697615]], atol=1e-6)
 
 
+@pytest.mark.parametrize("heads", [1, 4])
+def test_like_boxes_have_the_higher_logits_before_any_training(heads: int) -> None:
+    torch.manual_seed(0)
+    boxes, there = torch.randn(1, 6, 64), torch.ones(1, 6, dtype=torch.bool)
+    logits = TemporalFlow(64, heads)(boxes, boxes, there, there, torch.zeros(1))[0][0, :6, :6]
+    assert (logits.argmax(0) == torch.arange(6)).all()
+    assert (logits.argmax(1) == torch.arange(6)).all()
+
+
 def test_order_of_boxes_permutes_the_affinity_h12() -> None:
     torch.manual_seed(0)
     flow = TemporalFlow(16, 4).eval()
