@@ -79,7 +79,7 @@ def _judged(claim: Claim, work: Work) -> dict[str, Any] | None:
 def _run_entry(claim: Claim, name: str, seed: int, results: Mapping[str, Any], work: Work) -> dict[str, Any]:
     run = next(run for run in claim.runs if run.name == name)
     about, content = work.training(run, seed), results[name][seed]
-    kept = {key: about.get(key) for key in ("commit", "date", "seconds")}
+    kept = {key: about.get(key) for key in ("training", "commit", "date", "seconds")}
     return {"run": name, "seed": seed, "frames": len(content["frames"]), "figures": content["figures"], **kept}
 
 
@@ -142,13 +142,19 @@ def _name_of(run: Any) -> str:
     return run["name"] if isinstance(run, dict) else "to reach"
 
 
+def spent(entries: Sequence[Mapping[str, Any]]) -> float:
+    """Seconds of wall time of all runs of these claims; a training that several runs evaluate counts once."""
+    runs = [run for entry in entries for run in entry["runs"]]
+    seconds = {(run.get("training") or run["run"], run["seed"]): run["seconds"] or 0 for run in runs}
+    return float(sum(seconds.values()))
+
+
 def _how(stated: ClaimsFile, done: Sequence[Mapping[str, Any]], command: str) -> str:
-    seconds = {(run["run"], run["seed"]): run["seconds"] or 0 for entry in done for run in entry["runs"]}
     lines = [
         "## How it was measured\n",
         f"`{command}`, {date.today().isoformat()}, lidarfw {__version__}, commit {commit() or 'unknown'}, "
         f"{platform.machine()} with {os.cpu_count()} cores. Wall time of all runs together: "
-        f"{sum(seconds.values()) / 60:.0f} minutes; several run at once.\n",
+        f"{spent(done) / 60:.0f} minutes; several run at once.\n",
         f"Differences are variant less baseline. An interval is the middle 90 % of {stated.resamples} bootstrap "
         "samples. A sample draws the seeds with replacement and, for all seeds alike, the test frames, in blocks of "
         f"{stated.block} consecutive frames of a sequence; figures such as average precision are computed anew on the "

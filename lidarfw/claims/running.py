@@ -178,9 +178,10 @@ class Work:
         return _read_json(file) if file.is_file() else None
 
     def training(self, run: Run, seed: int) -> dict[str, Any]:
-        """When, from which commit and in which time a run was trained."""
+        """When, from which commit and in which time a run was trained; `training` names what it shares with others."""
         folder = self._files[run.name, seed].file.parent
-        return {**_read_json(folder / _TRAINED), "seconds": sum(_read_json(folder / _SECONDS).values())}
+        spent = sum(_read_json(folder / _SECONDS).values())
+        return {**_read_json(folder / _TRAINED), "seconds": spent, "training": folder.parent.name}
 
     @property
     def left(self) -> list[Job]:

@@ -148,6 +148,10 @@ def test_effects_are_found_and_nothing_runs_twice(file, tmp_path, start, capsys)
     assert (out / "toy.png").read_bytes().startswith(b"\x89PNG")
     assert 'A. Nybody, "Training helps"' in (out / "toy.md").read_text()
 
+    made = {(run["training"], run["seed"]): run["seconds"] for entry in figures.values() for run in entry["runs"]}
+    assert len(made) == 2 * 2
+    assert reporting.spent(list(figures.values())) == pytest.approx(sum(made.values()))
+
     before = len(start.started)
     assert main(arguments) == 0
     assert len(start.started) == before
