@@ -165,6 +165,7 @@ class SpatialFlow(nn.Module):
         self.layers = nn.TransformerEncoder(layer, layers, enable_nested_tensor=False)
 
     def forward(self, features: Tensor, mask: Tensor) -> Tensor:
+        """F^ (B, K, d) of F (B, K, d), with mask (B, K)."""
         if features.numel() == 0:
             return features
         if self.alone:
