@@ -31,6 +31,7 @@ DISTANCE = 2.0  # metres between centres up to which a box may be matched; also 
 RECALLS = np.linspace(0.1, 1, 40).round(12)
 _NONE = -1
 _SEQUENCE, _FRAME, _LABEL, _ID, _X, _Y, _SCORE = range(7)  # columns
+_MOTAR = ("devkit", "definition")
 _MEANS = ("amota", "amotp", "mota", "motp", "recall")
 
 
@@ -44,15 +45,17 @@ class NuscenesTracking(Metric):
     the weights of the two sightings beside a gap (it makes no difference in the middle); "clean" does it right.
 
     A track is kept or dropped as a whole by its mean score. At 40 recalls from 0.1 to 1 the score threshold is read
-    off the matches; AMOTA is the mean of max(0, 1 - false positives / matches that are no switch), AMOTP that of the
-    matches' distance (m); recalls that are not reached count as 0 and 2 m.
+    off the matches; AMOTA is the mean of MOTAR over them, AMOTP that of the matches' distance (m); recalls that are
+    not reached count as 0 and 2 m. MOTAR is max(0, 1 - false positives / matches that are no switch) with
+    `motar="devkit"`, which published figures use, so that a switch costs nothing there. The formula of the challenge
+    with the recall of all matches, max(0, 1 - (switches + false positives) / matches), is `motar="definition"`.
 
     Objects and tracks beyond the range of their class (`max_range` by class name, nuScenes' by default;
     `default_range` for the others), metres on the ground from the sensor, do not count. `compute` gives for classes
     with an object `{class}_{amota,amotp,mota,motp,recall,ids,frag,mt,ml,tp,fp,fn}` and the means `amota`, `amotp`,
     `mota`, `motp`, `recall`; without any object 0, and 2 m. Frames without track labels are not counted. Kept are
-    the centres, since interpolation needs what comes later. Raises ConfigError for unknown rules and for a class in
-    `max_range` that the data does not have, DataError where an id occurs twice in a frame.
+    the centres, since interpolation needs what comes later. Raises ConfigError for unknown `rules` or `motar` and for
+    a class in `max_range` that the data does not have, DataError where an id occurs twice in a frame.
     """
 
     monitor: ClassVar[str] = "amota"
@@ -69,12 +72,17 @@ class NuscenesTracking(Metric):
         max_range: dict[str, float] | None = None,
         default_range: float = 50.0,
         rules: str = "devkit",
+        motar: str = "devkit",
     ) -> None:
         super().__init__()
         if rules not in RULES:
             raise ConfigError(f"metric.nuscenes_tracking has no rules '{rules}'.\n  fix: rules=devkit or rules=clean")
+        if motar not in _MOTAR:
+            raise ConfigError(
+                f"metric.nuscenes_tracking has no motar '{motar}'.\n  fix: motar=devkit or motar=definition"
+            )
         usual = {name: value for name, value in USUAL_RANGE.items() if name in tracks.classes}
-        self.classes, self.rules = tracks.classes, rules
+        self.classes, self.rules, self.motar = tracks.classes, rules, motar
         self.range = per_class(tracks.classes, {**usual, **(max_range or {})}, default_range, "max_range")
         for name in ("objects", "boxes", "frames"):
             self.add_state(name, default=[], dist_reduce_fx="cat")
@@ -121,7 +129,8 @@ class NuscenesTracking(Metric):
         for label, name in enumerate(self.classes):
             own, own_boxes = (rows[rows[:, _LABEL] == label] for rows in (objects, boxes))
             if len(own):
-                found[name] = evaluate(_objects(own, frames, self.rules), _objects(own_boxes, frames, self.rules))
+                known, tracked = (_objects(rows, frames, self.rules) for rows in (own, own_boxes))
+                found[name] = evaluate(known, tracked, self.motar)
         figures = {
             f"{name.lower().replace(' ', '_')}_{key}": value
             for name, own in found.items()
@@ -251,8 +260,8 @@ def score_thresholds(scores: Array, objects: int) -> Array:
     return np.where(recall[-1] >= RECALLS, np.interp(RECALLS, recall, falling), np.nan)
 
 
-def evaluate(objects: Objects, boxes: Objects) -> dict[str, float]:
-    """All figures of one class with at least one object."""
+def evaluate(objects: Objects, boxes: Objects, motar: str = "devkit") -> dict[str, float]:
+    """All figures of one class with at least one object; `motar` as `NuscenesTracking` has it."""
     whole = follow(objects, boxes, np.array([-np.inf]))
     matched = whole.box[0][(whole.box[0] != _NONE) & ~whole.switch[0]]
     thresholds = score_thresholds(boxes.score[matched], len(objects.track))
@@ -267,7 +276,7 @@ def evaluate(objects: Objects, boxes: Objects) -> dict[str, float]:
             "ml": 1.0,
             "fn": float(len(objects.track)),
         }
-    rows = _clear_mot(objects, boxes, follow(objects, boxes, reached), reached)
+    rows = _clear_mot(objects, boxes, follow(objects, boxes, reached), reached, motar)
     missing = len(RECALLS) - len(reached)
     amota, amotp = rows["motar"].sum() / len(RECALLS), (rows["motp"].sum() + missing * DISTANCE) / len(RECALLS)
     best = len(reached) - 1 - int(rows["mota"][::-1].argmax())  # of equal ones that of the highest recall
@@ -275,16 +284,15 @@ def evaluate(objects: Objects, boxes: Objects) -> dict[str, float]:
     return {"amota": float(amota), "amotp": float(amotp), **own}
 
 
-def _clear_mot(objects: Objects, boxes: Objects, found: Following, thresholds: Array) -> dict[str, Array]:
+def _clear_mot(objects: Objects, boxes: Objects, found: Following, thresholds: Array, motar: str) -> dict[str, Array]:
     """Figures (W,) at each threshold."""
     hit, total = found.box != _NONE, len(objects.track)
     tp, ids = hit.sum(1), found.switch.sum(1)
     fp = (boxes.score >= thresholds[:, None]).sum(1) - tp
-    plain = tp - ids
-    motar = np.where(plain > 0, 1 - fp / np.maximum(plain, 1), 0).clip(0)
+    wrong, right = (fp, tp - ids) if motar == "devkit" else (fp + ids, tp)
     frag, mt, ml = _continuity(objects, hit)
     return {
-        "motar": motar,
+        "motar": np.where(right > 0, 1 - wrong / np.maximum(right, 1), 0).clip(0),
         "mota": (1 - (total - tp + ids + fp) / total).clip(0),
         "motp": np.where(tp > 0, found.distance.sum(1) / np.maximum(tp, 1), DISTANCE),
         "recall": tp / total,
