@@ -46,4 +46,8 @@ def require_checkpoint(path: str | Path) -> None:
         raise CheckpointError(f"{path} is an address.\n  fix: download it first, and give the file")
     if not path.exists():
         there = ", ".join(sorted(p.name for p in path.parent.glob("*.ckpt"))) if path.parent.is_dir() else ""
-        raise CheckpointError(f"there is no checkpoint {path}" + (f"\n  in that folder: {there}" if there else ""))
+        raise CheckpointError(
+            f"there is no checkpoint {path}\n"
+            + (f"  in that folder: {there}\n" if there else "")
+            + "  fix: `lidarfw train` writes checkpoints/best.ckpt and last.ckpt into the folder of its run"
+        )

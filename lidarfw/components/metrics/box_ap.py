@@ -40,6 +40,32 @@ def average_precision(score: Tensor, verdict: Tensor, objects: int) -> float:
     return float(torch.cat([best, best.new_zeros(1)])[step].sum() / RECALLS)
 
 
+def overlaps(boxes: Boxes, truth: Boxes, ignored: Boxes | None, measure: str) -> tuple[Tensor, Tensor]:
+    """IoU (N, M) of detections with objects, ignored ones last, and whether they are of one frame and class.
+
+    Ignored regions known only in the picture, which have no size, are left out; label -1 is of any class.
+    """
+    ignored = Boxes.empty(device=truth.batch.device) if ignored is None else ignored
+    ignored = ignored[(ignored.size > 0).all(1)]
+    label, batch = torch.cat([truth.label, ignored.label]), torch.cat([truth.batch, ignored.batch])
+    overlap: Tensor = MEASURES[measure](boxes.tensor.double(), torch.cat([truth.tensor, ignored.tensor]).double())
+    fits = (boxes.label[:, None] == label) | (label == -1)
+    return overlap, fits & (boxes.batch[:, None] == batch)
+
+
+def objects_taken(overlap: Tensor, fits: Tensor, count: int) -> Tensor:
+    """Object (N,) that each detection takes in its turn, -1 for none; the `count` to be found come before ignored ones."""
+    found_first = torch.arange(overlap.shape[1], device=overlap.device) < count
+    return greedy_match(torch.where(fits, overlap + found_first * 2, -torch.inf))
+
+
+def verdict(taken: Tensor, count: int) -> Tensor:
+    """TRUE, FALSE or IGNORED (N,) for detections that take these objects; the first `count` are those to be found."""
+    verdict = torch.where(taken >= 0, IGNORED, FALSE)
+    verdict[(taken >= 0) & (taken < count)] = TRUE
+    return verdict
+
+
 class BoxAP(Metric):
     """Average precision of rotated boxes, per class and as the mean over classes, by 3D and bird's-eye-view IoU.
 
@@ -86,27 +112,16 @@ class BoxAP(Metric):
         if targets.boxes is None:
             return
         truth = targets.boxes
-        ignored = Boxes.empty(device=truth.batch.device) if targets.ignored is None else targets.ignored
         boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
-        verdicts = [self._judge(boxes, truth, ignored[(ignored.size > 0).all(1)], measure) for measure in MEASURES]
+        verdicts = []
+        for measure in MEASURES:
+            overlap, fits = overlaps(boxes, truth, targets.ignored, measure)
+            threshold = overlap.new_tensor(self.iou)[boxes.label]
+            taken = objects_taken(overlap, fits & (overlap >= threshold[:, None]), len(truth))
+            verdicts.append(verdict(taken, len(truth)).float())
         rows = torch.stack([boxes.label.float(), boxes.score.float(), *verdicts], 1)
         self.detections.append(rows.to(self.device))
         self.objects += truth.label.bincount(minlength=len(self.classes)).to(self.device)
-
-    def _judge(self, boxes: Boxes, truth: Boxes, ignored: Boxes, measure: str) -> Tensor:
-        """Verdict (N,) on each detection; they are sorted by falling score."""
-        tensor = boxes.tensor.double()
-        objects = torch.cat([truth.tensor, ignored.tensor]).double()
-        label, batch = torch.cat([truth.label, ignored.label]), torch.cat([truth.batch, ignored.batch])
-        overlap: Tensor = MEASURES[measure](tensor, objects)
-        threshold = overlap.new_tensor(self.iou)[boxes.label]
-        fits = (boxes.label[:, None] == label) | (label == -1)
-        fits &= (boxes.batch[:, None] == batch) & (overlap >= threshold[:, None])
-        counts = torch.arange(len(label), device=label.device) < len(truth)
-        taken = greedy_match(torch.where(fits, overlap + counts * 2, -torch.inf))  # objects to find come first
-        verdict = torch.where(taken >= 0, IGNORED, FALSE)
-        verdict[(taken >= 0) & (taken < len(truth))] = TRUE
-        return verdict.float()
 
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""

@@ -9,11 +9,16 @@ import math
 from typing import Any, ClassVar
 
 import torch
-from lidarfw.components.matching import greedy_match
-from lidarfw.components.metrics.box_ap import FALSE, IGNORED, TRUE, USUAL_IOU, average_precision
+from lidarfw.components.metrics.box_ap import (
+    FALSE,
+    USUAL_IOU,
+    average_precision,
+    objects_taken,
+    overlaps,
+    verdict,
+)
 from lidarfw.components.per_class import per_class
 from lidarfw.interfaces import Metric
-from lidarfw.ops import iou_3d
 from lidarfw.types import Boxes, Spec, Targets
 from torch import Tensor
 
@@ -70,12 +75,11 @@ class BoxQuality(Metric):
         if targets.boxes is None:
             return
         truth = targets.boxes
-        ignored = Boxes.empty(device=truth.batch.device) if targets.ignored is None else targets.ignored
         boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
-        overlap, fits = _overlap(boxes, truth, ignored[(ignored.size > 0).all(1)])
+        overlap, fits = overlaps(boxes, truth, targets.ignored, "3d")
         strict = overlap.new_tensor(self.iou)[boxes.label][:, None]
-        judged = _taken(overlap, fits & (overlap >= strict), len(truth))
-        paired = _taken(overlap, fits & (overlap >= self.matched), len(truth))
+        judged = objects_taken(overlap, fits & (overlap >= strict), len(truth))
+        paired = objects_taken(overlap, fits & (overlap >= self.matched), len(truth))
         self.detections.append(_rows(boxes, truth, overlap, judged, paired).to(self.device))
         self.objects.append(torch.stack([truth.label.float(), _range(truth), _occlusion(truth)], 1).to(self.device))
 
@@ -101,25 +105,9 @@ class BoxQuality(Metric):
         )
 
 
-def _overlap(boxes: Boxes, truth: Boxes, ignored: Boxes) -> tuple[Tensor, Tensor]:
-    """3D IoU (N, M) of detections with objects, ignored ones last, and whether they are of one frame and class."""
-    label, batch = torch.cat([truth.label, ignored.label]), torch.cat([truth.batch, ignored.batch])
-    overlap = iou_3d(boxes.tensor.double(), torch.cat([truth.tensor, ignored.tensor]).double())
-    fits = (boxes.label[:, None] == label) | (label == -1)
-    return overlap, fits & (boxes.batch[:, None] == batch)
-
-
-def _taken(overlap: Tensor, fits: Tensor, count: int) -> Tensor:
-    """Column (N,) that each row takes, in their order, -1 none; the first `count` columns come before the others."""
-    first = torch.arange(overlap.shape[1], device=overlap.device) < count
-    return greedy_match(torch.where(fits, overlap + first * 2, -torch.inf))
-
-
 def _rows(boxes: Boxes, truth: Boxes, overlap: Tensor, judged: Tensor, paired: Tensor) -> Tensor:
     """(N, 9) of the detections."""
     count = len(truth)
-    verdict = torch.where(judged >= 0, IGNORED, FALSE)
-    verdict[(judged >= 0) & (judged < count)] = TRUE
     matched = (paired >= 0) & (paired < count)
     hit = torch.where((judged >= 0) & (judged < count), judged, torch.where(matched, paired, -1))
     distance, occlusion = _range(boxes), torch.full_like(boxes.score, -1)
@@ -133,7 +121,7 @@ def _rows(boxes: Boxes, truth: Boxes, overlap: Tensor, judged: Tensor, paired: T
         center = (boxes.center - truth.center[at]).norm(dim=1)
         turn = (boxes.yaw - truth.yaw[at]).remainder(math.pi)
         yaw = torch.minimum(turn, math.pi - turn)
-    columns = (boxes.label, boxes.score, verdict, distance, occlusion, matched, iou, center, yaw)
+    columns = (boxes.label, boxes.score, verdict(judged, count), distance, occlusion, matched, iou, center, yaw)
     return torch.stack([column.float() for column in columns], 1)
 
 
