@@ -54,7 +54,7 @@ def overlaps(boxes: Boxes, truth: Boxes, ignored: Boxes | None, measure: str) ->
 
 
 def objects_taken(overlap: Tensor, fits: Tensor, count: int) -> Tensor:
-    """Object (N,) that each detection takes in its turn, -1 for none; the `count` to be found come before ignored ones."""
+    """Object (N,) that each detection takes in turn, -1 for none; the `count` to be found come before ignored ones."""
     found_first = torch.arange(overlap.shape[1], device=overlap.device) < count
     return greedy_match(torch.where(fits, overlap + found_first * 2, -torch.inf))
 
