@@ -233,7 +233,14 @@ class PerceptionModule(pl.LightningModule):
         filled = {name: value for name, value in known.items() if name in accepted and node.get(name) is None}
         if not math.isfinite(steps) and {"total_steps", "T_max"} & set(filled):
             raise ConfigError("this scheduler needs to know the length of the run.\n  fix: trainer.max_epochs=N")
-        scheduler = _call("scheduler", factory, optimizer, **filled)
+        try:
+            scheduler = _call("scheduler", factory, optimizer, **filled)
+        except ZeroDivisionError as error:  # OneCycleLR where the rise is one step long
+            raise ConfigError(
+                f"scheduler: {factory.func.__name__} cannot divide a run of {steps} steps with these options.\n"
+                "  fix: another scheduler.pct_start (that share of the steps may not be exactly one), "
+                "or scheduler=constant"
+            ) from error
         return {"scheduler": scheduler, "interval": interval, "monitor": self.monitor, "strict": False}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

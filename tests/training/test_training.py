@@ -264,6 +264,11 @@ def test_wrong_settings(override, text, run, tmp_path):
         run(tmp_path, override)
 
 
+def test_a_cycle_that_rises_for_one_step(run, tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot divide a run of 2 steps(.|\n)*another scheduler.pct_start"):
+        run(tmp_path, "trainer.max_steps=2", "scheduler.pct_start=0.5")
+
+
 def test_slurm_outside_of_a_job(run, tmp_path, monkeypatch):
     monkeypatch.delenv("SLURM_NTASKS", raising=False)
     with pytest.raises(ConfigError, match="inside a Slurm job only"):
