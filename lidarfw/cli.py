@@ -29,6 +29,7 @@ COMMANDS = {
     "claims": "test what a method is said to gain: runs, intervals, verdicts",
     "completion": "print the shell code that completes names with <TAB>",
 }
+_MANY = ("overrides", "scans", "what", "data")  # arguments of commands that take any number of words
 _EXAMPLES = """examples:
   lidarfw list head
   lidarfw show backbone=second neck=[height_compression,bev_fpn] head=center
@@ -63,7 +64,20 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     if chosen == "train" and not {"-h", "--help"} & set(arguments):
         rest = [argument for argument in arguments[1:] if argument != "--debug"]
         return argparse.Namespace(command="train", overrides=rest, debug="--debug" in arguments)
-    return parser(chosen).parse_args(arguments)
+    top = parser(chosen)
+    args, rest = top.parse_known_args(arguments)
+    if rest:
+        _add_late(args, rest, top)
+    return args
+
+
+def _add_late(args: argparse.Namespace, rest: list[str], top: argparse.ArgumentParser) -> None:
+    """Overrides or scans behind an option, which argparse leaves over once it has given away those before it."""
+    many = [name for name in _MANY if isinstance(getattr(args, name, None), list)]
+    strange = [argument for argument in rest if argument.startswith("-") or not many]
+    if strange:
+        top.error(f"unrecognized arguments: {' '.join(strange)}")
+    getattr(args, many[0]).extend(rest)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
