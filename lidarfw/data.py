@@ -26,7 +26,6 @@ from lidarfw.types import Batch, Frame, collate
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-STAGES = ("train", "val", "test")
 BAD_SAMPLE_POLICIES = ("error", "skip")
 MAX_SKIPPED = 0.1  # share of the frames of a split that `bad_sample: skip` puts up with; one frame always
 _BROKEN_FILE = (DataError, OSError, ValueError)  # what a broken file causes; any other exception is a bug
@@ -371,13 +370,13 @@ class DataModule(pl.LightningDataModule):
         self._resume: dict[str, int] | None = None
 
     @classmethod
-    def from_config(cls, config: DictConfig, streams: bool = True) -> DataModule:
-        """Datasets of `config.splits`, with the transforms of the config."""
+    def from_config(cls, config: DictConfig, stages: Sequence[str], streams: bool = True) -> DataModule:
+        """Datasets of `config.splits` for these stages (train, val, test), with the transforms of the config."""
         from lidarfw.assembly import make_dataset, make_transforms
 
-        stages = [stage for stage in STAGES if config.splits.get(stage)]
-        datasets = {stage: make_dataset(config, config.splits[stage]) for stage in stages}
-        transforms = {stage: make_transforms(config, training=stage == "train") for stage in stages}
+        there = [stage for stage in stages if config.splits.get(stage)]
+        datasets = {stage: make_dataset(config, config.splits[stage]) for stage in there}
+        transforms = {stage: make_transforms(config, training=stage == "train") for stage in there}
         return cls(datasets, transforms, seed=config.seed, streams=streams, **config.loader)
 
     def prepare_data(self) -> None:

@@ -331,7 +331,7 @@ def train(config: DictConfig) -> dict[str, float]:
         model = build(wired)
         _initialise(model, config.init)
         module = _module(model, to_plain(config), checkpoint.describe(wired))
-        data = DataModule.from_config(config, streams=bool(model.filters))
+        data = DataModule.from_config(config, ("train", "val"), streams=bool(model.filters))
         trainer = make_trainer(config, folder, [stop], validate="val" in data.datasets)
         if trainer.is_global_zero:
             write_text(folder / "config.yaml", yaml.safe_dump(wired.config, sort_keys=False, allow_unicode=True))
@@ -475,7 +475,7 @@ def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecor
         trainer = make_trainer(config, Path(path).parent, [stop])
         if record is not None and trainer.world_size > 1:
             raise ConfigError("figures of single frames need an evaluation in one process.\n  fix: trainer.devices=1")
-        data = DataModule.from_config(config, streams=bool(model.filters))
+        data = DataModule.from_config(config, ("test",), streams=bool(model.filters))
         trainer.test(module, datamodule=data, verbose=False)
     return {name.removeprefix("test/"): float(value) for name, value in trainer.callback_metrics.items()}
 

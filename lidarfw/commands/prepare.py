@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
     from lidarfw.config import compose
 
     config = compose(args.overrides)
-    splits = dict.fromkeys(config.splits.values())
+    splits = dict.fromkeys(split for split in config.splits.values() if split)
     datasets = {split: make_dataset(config, split) for split in splits}
     for split, dataset in datasets.items():
         dataset.prepare(args.workers)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import training_parts
 from training_runs import Child, settings
 
 import lidarfw
@@ -24,8 +25,6 @@ from lidarfw.types import Frame, collate
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    import training_parts
-
     from lidarfw import registry
 
     folder = tmp_path_factory.mktemp("trained")
@@ -40,8 +39,6 @@ def file(trained, tmp_path) -> Path:
 
 
 def frame() -> Frame:
-    import training_parts
-
     return training_parts.ToyDataset(split="val")[0]
 
 
@@ -314,6 +311,19 @@ def test_evaluate_with_other_data_and_settings(trained):
         ]
         == 2
     )
+
+
+def test_only_the_split_in_question_is_read(trained, monkeypatch):
+    asked = []
+    monkeypatch.setattr(training_parts.ToyDataset, "prepare", lambda self, workers=1: asked.append(self.split))
+    evaluate(trained, ["splits.test=elsewhere"])
+    assert asked == ["elsewhere"]
+
+
+def test_what_is_tested_is_what_was_validated_on(run, tmp_path):
+    run(tmp_path, "trainer.max_epochs=1", "splits.val=elsewhere")
+    config = checkpoint.config_of(checkpoint.description(checkpoint.read(tmp_path / "checkpoints/last.ckpt"), ""), "")
+    assert config["splits"]["test"] == "elsewhere"
 
 
 def test_evaluate_does_not_depend_on_the_batch_size(trained):
