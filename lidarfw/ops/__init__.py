@@ -11,6 +11,7 @@ from lidarfw.ops.boxes import (
     paired_iou_bev,
     points_in_boxes,
     points_in_boxes_mask,
+    points_per_box,
 )
 from lidarfw.ops.cells import (
     CellAssignment,
@@ -59,6 +60,7 @@ __all__ = [
     "paired_iou_bev",
     "points_in_boxes",
     "points_in_boxes_mask",
+    "points_per_box",
     "range_knn",
     "range_knn_mean",
     "range_match",

@@ -88,6 +88,13 @@ def points_in_boxes(
     return torch.where(first < len(boxes), first, -1)
 
 
+def points_per_box(
+    xyz: Tensor, boxes: Tensor, xyz_batch: Tensor | None = None, box_batch: Tensor | None = None
+) -> Tensor:
+    """(M,) int64: how many points (N, 3) lie in each box (M, 7) or on its surface; batches as in `points_in_boxes`."""
+    return _containing_pairs(xyz, boxes, xyz_batch, box_batch)[1].bincount(minlength=len(boxes))
+
+
 def _clipped_share(start: tuple[Tensor, Tensor], step: tuple[Tensor, Tensor], half: tuple[Tensor, Tensor]) -> Tensor:
     """Share 0..1 of each edge start + t step, t in 0..1, that lies in the rectangle |x| <= half x, |y| <= half y."""
     low, high = torch.zeros_like(start[0]), torch.ones_like(start[0])

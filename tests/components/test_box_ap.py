@@ -11,7 +11,7 @@ import torch
 
 from lidarfw.components.metrics.box_ap import FALSE, IGNORED, TRUE, BoxAP, average_precision
 from lidarfw.errors import ConfigError
-from lidarfw.types import Boxes, Spec, Targets
+from lidarfw.types import Boxes, Points, Spec, Targets
 
 pytestmark = pytest.mark.filterwarnings("ignore:The ``compute`` method of metric BoxAP was called before")
 SPEC = Spec(Boxes, classes=("Car", "Pedestrian", "Traffic Cone"))
@@ -101,6 +101,25 @@ def test_ignored_objects_are_neither_right_nor_wrong() -> None:
     assert figures((false, Targets(truth, van)))["car_3d_ap"] == pytest.approx(0.833333, abs=1e-6)
     of_other_class = replace(van, label=torch.tensor([1]))
     assert figures((false, Targets(truth, of_other_class)))["car_3d_ap"] == pytest.approx(0.75)
+
+
+def test_objects_that_the_sensor_did_not_see_are_ignored() -> None:
+    """The car at 20 m has two points, one of them on its surface; the third point lies in the other frame."""
+    xyz = torch.tensor([[0.0, 0, 0], [20, 0, 0], [22, 1, 0.75], [20, 0, 0]])
+    points = Points(xyz, torch.zeros(4, 0), torch.tensor([0, 0, 0, 1]), 2)
+    truth, found = boxes_of([0, 20, 40]), boxes_of([0, 20, 40], [0.9, 0.8, 0.7])
+
+    def ap(least: int, found: Boxes) -> tuple[float, int]:
+        metric = BoxAP(SPEC, Spec(Points), min_points=least)
+        metric.update(found, Targets(truth, boxes_of([60.0])), points)
+        return metric.compute()["car_3d_ap"], int(metric.objects[0])
+
+    assert ap(0, found[:2]) == (pytest.approx(26 / 40), 3)
+    assert ap(1, found[:2]) == (1.0, 2)
+    assert ap(2, found) == (1.0, 1)
+    assert ap(2, Boxes.cat([found, boxes_of([60, 80], [1.0, 0.95])])) == (pytest.approx(0.5), 1)
+    with pytest.raises(ConfigError, match="min_points counts points"):
+        BoxAP(SPEC, min_points=1)
 
 
 def test_an_object_to_find_comes_before_an_ignored_one() -> None:

@@ -9,9 +9,10 @@ from torch import Tensor
 
 from lidarfw.components.matching import greedy_match
 from lidarfw.components.per_class import per_class
+from lidarfw.errors import ConfigError
 from lidarfw.interfaces import Metric
-from lidarfw.ops import iou_3d, iou_bev
-from lidarfw.types import Boxes, Spec, Targets
+from lidarfw.ops import iou_3d, iou_bev, points_per_box
+from lidarfw.types import Boxes, Points, Spec, Targets
 
 MEASURES = {"3d": iou_3d, "bev": iou_bev}
 USUAL_IOU = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # KITTI's
@@ -38,6 +39,13 @@ def average_precision(score: Tensor, verdict: Tensor, objects: int) -> float:
     grid = torch.arange(1, RECALLS + 1, device=score.device, dtype=torch.float64) * objects
     step = torch.searchsorted(found * RECALLS, grid)
     return float(torch.cat([best, best.new_zeros(1)])[step].sum() / RECALLS)
+
+
+def seen(truth: Boxes, ignored: Boxes | None, points: Points, least: int) -> tuple[Boxes, Boxes]:
+    """Objects with at least so many points in their box, and the ignored ones with the others among them."""
+    inside = points_per_box(points.xyz, truth.tensor.to(points.xyz), points.batch, truth.batch)
+    hidden = truth[inside < least]
+    return truth[inside >= least], hidden if ignored is None else Boxes.cat([ignored, hidden])
 
 
 def overlaps(boxes: Boxes, truth: Boxes, ignored: Boxes | None, measure: str) -> tuple[Tensor, Tensor]:
@@ -72,7 +80,9 @@ class BoxAP(Metric):
     By falling score each detection takes the free object of its class, in the same frame, with the highest IoU at or
     above the threshold. `iou` gives thresholds by class name (Car 0.7, Pedestrian and Cyclist 0.5 where not given),
     `default_iou` that of the others. A detection that hits only an ignored object (`Targets.ignored`; label -1 is
-    for any class) counts neither for nor against; ignored regions known only in the picture play no part here.
+    for any class) counts neither for nor against; ignored regions known only in the picture play no part here. Objects
+    with fewer than `min_points` points in their box are ignored too: nobody finds what the sensor did not see, and
+    nuScenes leaves out objects without any point, Waymo's first level those with up to five (`min_points=6`).
 
     Precision is averaged over 40 recalls, which is defined for any number of objects. KITTI's own procedure takes
     its score thresholds from the true positives and needs more than 40 of them to reach its upper bound; that one,
@@ -80,7 +90,7 @@ class BoxAP(Metric):
 
     `compute` gives `{class}_3d_ap`, `{class}_bev_ap` of the classes with an object, and `mean_3d_ap`, `mean_bev_ap`
     (0 without any object), all 0..1. Frames without box labels are not counted. Only scores, verdicts and counts are
-    kept. Raises ConfigError for a class in `iou` that the data does not have.
+    kept. Raises ConfigError for a class in `iou` that the data does not have, and for `min_points` without points.
     """
 
     monitor: ClassVar[str] = "mean_3d_ap"
@@ -89,8 +99,19 @@ class BoxAP(Metric):
     detections: list[Tensor]  # (N, 4) label, score, verdict by 3D IoU, by BEV IoU
     objects: Tensor  # (K,) int64
 
-    def __init__(self, boxes: Spec, *, iou: dict[str, float] | None = None, default_iou: float = 0.5) -> None:
+    def __init__(
+        self,
+        boxes: Spec,
+        points: Spec | None = None,
+        *,
+        iou: dict[str, float] | None = None,
+        default_iou: float = 0.5,
+        min_points: int = 0,
+    ) -> None:
         super().__init__()
+        if min_points and points is None:
+            raise ConfigError("box_ap.min_points counts points, and the dataset gives none.\n  fix: min_points=0")
+        self.min_points = min_points
         usual = {name: value for name, value in USUAL_IOU.items() if name in boxes.classes}
         self.classes = boxes.classes
         self.iou = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "iou")
@@ -107,15 +128,17 @@ class BoxAP(Metric):
         super().reset()
         self._start()
 
-    def update(self, boxes: Boxes, targets: Targets) -> None:
+    def update(self, boxes: Boxes, targets: Targets, points: Points | None = None) -> None:
         """Count the detections of one frame, or of a batch of frames, in."""
         if targets.boxes is None:
             return
-        truth = targets.boxes
+        truth, ignored = targets.boxes, targets.ignored
+        if points is not None and self.min_points:
+            truth, ignored = seen(truth, ignored, points, self.min_points)
         boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
         verdicts = []
         for measure in MEASURES:
-            overlap, fits = overlaps(boxes, truth, targets.ignored, measure)
+            overlap, fits = overlaps(boxes, truth, ignored, measure)
             threshold = overlap.new_tensor(self.iou)[boxes.label]
             taken = objects_taken(overlap, fits & (overlap >= threshold[:, None]), len(truth))
             verdicts.append(verdict(taken, len(truth)).float())

@@ -97,7 +97,7 @@ def collect(objects: str | Path, sequences: str | Path) -> Statistics:
 def _cars(root: str) -> Array:
     """Distance, points, length, width, height of the cars that nothing hides."""
     from lidarfw.components.datasets.kitti import KittiDataset
-    from lidarfw.ops import points_in_boxes_mask
+    from lidarfw.ops import points_per_box
 
     dataset = KittiDataset(root=root, split="all", classes=("Car",))
     rows = []
@@ -107,7 +107,7 @@ def _cars(root: str) -> Array:
         if boxes is None or boxes.occlusion is None or boxes.truncation is None:
             raise DataError(f"{root}: frame {frame.meta.id} has no labels with occlusion and truncation")
         seen = (boxes.occlusion <= 0) & (boxes.truncation <= 0.05)
-        inside = points_in_boxes_mask(frame.inputs["points"].xyz, boxes.tensor).sum(0)
+        inside = points_per_box(frame.inputs["points"].xyz, boxes.tensor)
         table = np.concatenate([boxes.center.norm(dim=1)[:, None], inside[:, None], boxes.size], 1)
         rows.append(table[np.asarray(seen)])
     return np.concatenate(rows).astype(np.float64)
