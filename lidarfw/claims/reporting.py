@@ -201,7 +201,10 @@ def _figure(value: float | None) -> str:
 
 
 def forest_plot(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
-    """Gains of all claims in percent of the baseline's figure, with intervals; dots are single seeds."""
+    """Gains of all claims in percent of the larger figure, with intervals; dots are single seeds.
+
+    Of the larger one, so that a baseline next to nothing does not push all others together.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -213,7 +216,7 @@ def forest_plot(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
     axes.axvline(0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(entries)), [_label(entry) for entry in reversed(entries)], fontsize=9)
     axes.set_ylim(-0.6, len(entries) - 0.4)
-    axes.set_xlabel("← worse      gain over the baseline (% of its figure), 90 % interval; dots: seeds      better →")
+    axes.set_xlabel("← worse      gain in % of the larger figure, 90 % interval; dots: seeds      better →")
     axes.grid(axis="x", alpha=0.3)
     axes.spines[["top", "right", "left"]].set_visible(False)
     handles = [
@@ -228,7 +231,7 @@ def forest_plot(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
 
 def _draw_row(axes: Any, height: float, entry: Mapping[str, Any]) -> None:
     found, claim = entry["outcome"], entry["definition"]
-    scale = (100 if claim["better"] == "higher" else -100) / (abs(found["baseline"]) or abs(found["variant"]) or 1)
+    scale = (100 if claim["better"] == "higher" else -100) / (max(abs(found["baseline"]), abs(found["variant"])) or 1)
     low, high = sorted((found["low"] * scale, found["high"] * scale))
     colour, gain = _COLOUR[found["verdict"]], found["difference"] * scale
     axes.plot([low, high], [height, height], color=colour, linewidth=2.5, solid_capstyle="butt")
