@@ -10,7 +10,7 @@ visible, `inputs: {parameter: component}` must choose.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
@@ -274,10 +274,7 @@ class _Planner:
                 self.warnings.append(f"{head.id} has no loss and will not learn")
 
     def _warn_unread(self) -> None:
-        read = {ref.producer for step in self.steps for refs in step.takes.values() for ref in refs}
-        for step in self.steps:
-            if step.slot in ("backbone", "neck") and step.id not in read:
-                self.warnings.append(f"nothing reads the output of {step.id}")
+        self.warnings += [f"nothing reads the output of {step.id}" for step in unread(self.steps)]
 
     def _publish(self, step: Step) -> None:
         if step.slot in ("loss", "metric", "filter", "retriever"):
@@ -425,6 +422,16 @@ class _Planner:
             f"{step.id} could take {p} from {names}.\n  fix: write {key}: {{{p.name}: {found[-1].producer}}} "
             f"(on the command line: {key}.{p.name}={found[-1].producer})"
         )
+
+
+def unread(steps: Sequence[Step]) -> list[Step]:
+    """Backbones and necks whose output nothing reads.
+
+    A metric does not count: it is no reason to compute something, and reads what would be there without.
+    """
+    readers = [step for step in steps if step.slot != "metric"]
+    read = {ref.producer for step in readers for refs in step.takes.values() for ref in refs}
+    return [step for step in steps if step.slot in ("backbone", "neck") and step.id not in read]
 
 
 def _label_of(head: Step) -> type | None:

@@ -100,3 +100,8 @@ def test_a_combination_that_does_not_fit_is_refused() -> None:
     assert not table.fits(broken)
     with pytest.raises(assembly.AssemblyError, match="height_compression"):
         assembly.plan(broken.config(), table.data_spec("second"))
+
+
+def test_what_only_a_metric_reads_is_of_no_use() -> None:
+    """`box_ap` may count points, which is no reason to compute features on them behind a detector's neck."""
+    assert not [c.id for c in VALID if "voxels_to_points" in c.necks[-1:] and c.heads == ("center",)]

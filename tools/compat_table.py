@@ -109,9 +109,7 @@ def plan(combination: Combination) -> assembly.Plan | None:
 def fits(combination: Combination) -> bool:
     """Whether it can be wired, with a reader for what each part gives."""
     planned = plan(combination)
-    steps = [] if planned is None else planned.steps
-    read = {ref.producer for step in steps for refs in step.takes.values() for ref in refs}
-    return bool(steps) and all(step.id in read for step in steps if step.slot in ("backbone", "neck"))
+    return planned is not None and not assembly.unread(planned.steps)
 
 
 def chains(backbone: str) -> Iterator[tuple[str, ...]]:
