@@ -21,6 +21,7 @@ SMALL = ["dataset=synthetic", "head.msrm.grid=2", "head.msrm.regions=8", "head.m
     [
         ("second_msrm", "voxels", {"anchor", "msrm"}),
         ("pillars_msrm", "bev", {"anchor", "msrm"}),
+        ("taco_msrm", "points", {"center", "scene_coord", "msrm"}),
         ("taco_msrm", "voxels", {"center", "scene_coord", "msrm"}),
     ],
 )
@@ -29,7 +30,7 @@ def test_a_step_on_other_backbones(experiment: str, pool: str, losses: set[str])
         pytest.importorskip("lidarfw_taco")
     ranges = [] if experiment == "taco_msrm" else [f"backbone.{experiment[:-5]}.lower=[0,-25.6,-3]"]
     ranges += [] if experiment == "taco_msrm" else [f"backbone.{experiment[:-5]}.upper=[51.2,25.6,1]"]
-    config = compose([f"experiment={experiment}", *SMALL, *ranges])
+    config = compose([f"experiment={experiment}", *SMALL, *ranges, f"head.msrm.pool={pool}"])
     torch.manual_seed(0)
     model = build(plan(config)).train()
     head = next(module for module in model.modules() if isinstance(module, MSRMHead))
