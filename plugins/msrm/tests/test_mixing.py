@@ -30,7 +30,8 @@ def test_a_step_on_other_backbones(experiment: str, pool: str, losses: set[str])
         pytest.importorskip("lidarfw_taco")
     ranges = [] if experiment == "taco_msrm" else [f"backbone.{experiment[:-5]}.lower=[0,-25.6,-3]"]
     ranges += [] if experiment == "taco_msrm" else [f"backbone.{experiment[:-5]}.upper=[51.2,25.6,1]"]
-    config = compose([f"experiment={experiment}", *SMALL, *ranges, f"head.msrm.pool={pool}"])
+    chosen = ["head.msrm.pool=voxels"] if (experiment, pool) == ("taco_msrm", "voxels") else []
+    config = compose([f"experiment={experiment}", *SMALL, *ranges, *chosen])
     torch.manual_seed(0)
     model = build(plan(config)).train()
     head = next(module for module in model.modules() if isinstance(module, MSRMHead))
