@@ -136,15 +136,16 @@ class BoxAP(Metric):
         if points is not None and self.min_points:
             truth, ignored = seen(truth, ignored, points, self.min_points)
         boxes = boxes[boxes.score.argsort(descending=True, stable=True)]
-        verdicts = []
-        for measure in MEASURES:
-            overlap, fits = overlaps(boxes, truth, ignored, measure)
-            threshold = overlap.new_tensor(self.iou)[boxes.label]
-            taken = objects_taken(overlap, fits & (overlap >= threshold[:, None]), len(truth))
-            verdicts.append(verdict(taken, len(truth)).float())
+        verdicts = [self._judge(boxes, truth, ignored, measure).float() for measure in MEASURES]
         rows = torch.stack([boxes.label.float(), boxes.score.float(), *verdicts], 1)
         self.detections.append(rows.to(self.device))
         self.objects += truth.label.bincount(minlength=len(self.classes)).to(self.device)
+
+    def _judge(self, boxes: Boxes, truth: Boxes, ignored: Boxes | None, measure: str) -> Tensor:
+        """Verdict (N,) on each detection; they are sorted by falling score."""
+        overlap, fits = overlaps(boxes, truth, ignored, measure)
+        threshold = overlap.new_tensor(self.iou)[boxes.label]
+        return verdict(objects_taken(overlap, fits & (overlap >= threshold[:, None]), len(truth)), len(truth))
 
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""

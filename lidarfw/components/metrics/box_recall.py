@@ -9,7 +9,7 @@ from torch import Tensor
 
 from lidarfw.components.metrics.box_ap import FALSE, IGNORED, MEASURES, TRUE, BoxAP
 from lidarfw.components.per_class import per_class
-from lidarfw.types import Boxes, Spec, Targets
+from lidarfw.types import Boxes, Points, Spec, Targets
 
 KINDS = ("recall", "precision", "f1")
 
@@ -19,8 +19,8 @@ class BoxRecall(BoxAP):
 
     Asked for are the objects whose centre is at most `max_range` metres away and of which the labels say at most
     `max_occlusion` and `max_truncation` (where they say it). All others are ignored, and so is a detection beyond
-    `max_range` that matches nothing. Detections below `min_score` are left out. Matching is that of `box_ap`; `iou`
-    gives thresholds by class name, `default_iou` that of the others.
+    `max_range` that matches nothing. Detections below `min_score` are left out. Matching and `min_points` are
+    those of `box_ap`; `iou` gives thresholds by class name, `default_iou` that of the others.
 
     `compute` gives `{class}_{3d,bev}_{recall,precision,f1}` of the classes with an object, and
     `mean_{3d,bev}_{recall,precision,f1}` (0 without any object), all 0..1, and `{class}_objects`, their number.
@@ -32,6 +32,7 @@ class BoxRecall(BoxAP):
     def __init__(
         self,
         boxes: Spec,
+        points: Spec | None = None,
         *,
         iou: dict[str, float] | None = None,
         default_iou: float = 0.5,
@@ -39,20 +40,22 @@ class BoxRecall(BoxAP):
         max_occlusion: int = 0,
         max_truncation: float = 0.5,
         min_score: float = 0.3,
+        min_points: int = 0,
     ) -> None:
         thresholds = per_class(boxes.classes, iou or {}, default_iou, "iou")
-        super().__init__(boxes, iou=dict(zip(boxes.classes, thresholds)))
+        super().__init__(boxes, points, iou=dict(zip(boxes.classes, thresholds)), min_points=min_points)
         self.max_range, self.max_occlusion, self.max_truncation = max_range, max_occlusion, max_truncation
         self.min_score = min_score
 
-    def update(self, boxes: Boxes, targets: Targets) -> None:
+    def update(self, boxes: Boxes, targets: Targets, points: Points | None = None) -> None:
         """Count the detections of one frame, or of a batch of frames, in."""
         if targets.boxes is None:
             return
         asked = self._asked(targets.boxes)
         others = targets.boxes[~asked]
         ignored = others if targets.ignored is None else Boxes.cat([others, targets.ignored])
-        super().update(boxes[boxes.score >= self.min_score], Targets(boxes=targets.boxes[asked], ignored=ignored))
+        wanted = Targets(boxes=targets.boxes[asked], ignored=ignored)
+        super().update(boxes[boxes.score >= self.min_score], wanted, points)
 
     def _asked(self, truth: Boxes) -> Tensor:
         asked = _range(truth) <= self.max_range
@@ -60,7 +63,7 @@ class BoxRecall(BoxAP):
             asked &= True if value is None else value <= limit
         return asked
 
-    def _judge(self, boxes: Boxes, truth: Boxes, ignored: Boxes, measure: str) -> Tensor:
+    def _judge(self, boxes: Boxes, truth: Boxes, ignored: Boxes | None, measure: str) -> Tensor:
         verdict = super()._judge(boxes, truth, ignored, measure)
         return torch.where((verdict == FALSE) & (_range(boxes) > self.max_range), IGNORED, verdict)
 

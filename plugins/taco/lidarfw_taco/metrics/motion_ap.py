@@ -8,7 +8,7 @@ import torch
 from lidarfw.components.metrics.box_ap import USUAL_IOU, BoxAP
 from lidarfw.components.per_class import per_class
 from lidarfw.errors import ConfigError
-from lidarfw.types import Boxes, Spec, Targets
+from lidarfw.types import Boxes, Points, Spec, Targets
 
 STATES = ("moving", "static")
 
@@ -22,14 +22,23 @@ class MotionAP(BoxAP):
     `motion_state` does; ConfigError without.
     """
 
-    def __init__(self, boxes: Spec, *, iou: dict[str, float] | None = None, default_iou: float = 0.5) -> None:
+    def __init__(
+        self,
+        boxes: Spec,
+        points: Spec | None = None,
+        *,
+        iou: dict[str, float] | None = None,
+        default_iou: float = 0.5,
+        min_points: int = 0,
+    ) -> None:
         usual = {name: value for name, value in USUAL_IOU.items() if name in boxes.classes}
         overlaps = per_class(boxes.classes, {**usual, **(iou or {})}, default_iou, "iou")
         names = [f"{state} {name}" for state in STATES for name in boxes.classes]
         both = dict(zip(names, [*overlaps, *overlaps], strict=True))
-        super().__init__(dataclasses.replace(boxes, classes=tuple(names)), iou=both, default_iou=default_iou)
+        twice = dataclasses.replace(boxes, classes=tuple(names))
+        super().__init__(twice, points, iou=both, default_iou=default_iou, min_points=min_points)
 
-    def update(self, boxes: Boxes, targets: Targets) -> None:
+    def update(self, boxes: Boxes, targets: Targets, points: Points | None = None) -> None:
         """Count the detections of one frame, or of a batch of frames, in."""
         truth = targets.boxes
         if truth is None:
@@ -44,7 +53,8 @@ class MotionAP(BoxAP):
         asked = Boxes.cat([moving[state == 1], static[state == 0]])
         others = [moving[state != 1], static[state != 0]]
         others += [] if targets.ignored is None else self._twice(targets.ignored)
-        super().update(Boxes.cat(self._twice(boxes)), targets.replace(boxes=asked, ignored=Boxes.cat(others)))
+        split = targets.replace(boxes=asked, ignored=Boxes.cat(others))
+        super().update(Boxes.cat(self._twice(boxes)), split, points)
 
     def _twice(self, boxes: Boxes) -> list[Boxes]:
         """The boxes as objects of the moving classes, and of the static ones; label -1 stays."""
