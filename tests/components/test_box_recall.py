@@ -7,7 +7,7 @@ import torch
 
 from lidarfw.components.metrics.box_recall import KINDS, BoxRecall, f1_score
 from lidarfw.errors import ConfigError
-from lidarfw.types import Boxes, Spec, Targets
+from lidarfw.types import Boxes, Points, Spec, Targets
 
 pytestmark = pytest.mark.filterwarnings("ignore:The ``compute`` method of metric BoxRecall was called before")
 SPEC = Spec(Boxes, classes=("Car", "Pedestrian"))
@@ -38,6 +38,13 @@ def test_golden() -> None:
     strict = figures((boxes_of([5, 13], [0.9, 0.8]), Targets(truth)), iou={"Car": 0.7})
     assert (strict["car_bev_recall"], strict["car_bev_precision"]) == (pytest.approx(1 / 3), 0.5)
     assert strict["car_bev_f1"] == pytest.approx(0.4)
+
+
+def test_an_object_that_the_sensor_did_not_see_is_not_asked_for() -> None:
+    metric = BoxRecall(SPEC, Spec(Points), min_points=1)
+    points = Points.from_scan(torch.tensor([[5.0, 0, 0]]), torch.zeros(1, 0))
+    metric.update(boxes_of([5.0], [0.9]), Targets(boxes_of([5, 20])), points)
+    assert (metric.compute()["car_objects"], metric.compute()["car_bev_recall"]) == (1, 1)
 
 
 def test_f1_golden() -> None:

@@ -69,9 +69,9 @@ def objects_taken(overlap: Tensor, fits: Tensor, count: int) -> Tensor:
 
 def verdict(taken: Tensor, count: int) -> Tensor:
     """TRUE, FALSE or IGNORED (N,) for detections that take these objects; the first `count` are those to be found."""
-    verdict = torch.where(taken >= 0, IGNORED, FALSE)
-    verdict[(taken >= 0) & (taken < count)] = TRUE
-    return verdict
+    found = torch.where(taken >= 0, IGNORED, FALSE)
+    found[(taken >= 0) & (taken < count)] = TRUE
+    return found
 
 
 class BoxAP(Metric):

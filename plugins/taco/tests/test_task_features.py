@@ -8,7 +8,7 @@ from lidarfw.assembly import build, plan
 from lidarfw.config import compose
 from lidarfw.errors import ConfigError
 from lidarfw.testing.synthetic import SyntheticDataset
-from lidarfw.types import BEV, Boxes, Grid, Spec, Targets, collate, take
+from lidarfw.types import BEV, Boxes, Grid, Points, Spec, Targets, collate, take
 
 from lidarfw_taco.metrics.motion_ap import MotionAP
 from lidarfw_taco.metrics.task_features import TaskFeatures, neighbors
@@ -149,6 +149,15 @@ def test_precision_of_moving_and_of_static_objects() -> None:
     metric.reset()
     metric.update(found, ignored)
     assert metric.compute()["static_car_3d_ap"] == pytest.approx(0.5)
+
+
+def test_precision_by_motion_leaves_out_what_the_sensor_did_not_see() -> None:
+    """Only one of two parked cars has a point, and it is found."""
+    truth = boxes((1, 1, 0, 0), (1, 5, 0, 0))
+    metric = MotionAP(Spec(Boxes, classes=("Car",)), Spec(Points), min_points=1)
+    points = Points.from_scan(truth.center[:1], torch.zeros(1, 0))
+    metric.update(truth[:1].replace(score=torch.tensor([0.9])), Targets(truth), points)
+    assert metric.compute()["static_car_3d_ap"] == 1.0
 
 
 def test_precision_by_motion_needs_motion() -> None:
