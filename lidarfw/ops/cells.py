@@ -126,7 +126,7 @@ class _SegmentSum(torch.autograd.Function):
 
 def segment_sum(features: Tensor, order: Tensor, starts: Tensor) -> Tensor:
     """(V, C) sums: row v adds features[order[starts[v]:starts[v + 1]]], in that order. Not differentiable."""
-    if not order.numel():
+    if not order.numel() or not features.shape[1]:  # embedding_bag refuses rows of no width on some processors
         return features.new_zeros(len(starts) - 1, features.shape[1])
     return F.embedding_bag(order, features.detach(), starts, mode="sum", include_last_offset=True)
 
