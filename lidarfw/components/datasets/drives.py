@@ -17,7 +17,7 @@ from lidarfw._lazy import LazyModule
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces.data import Dataset
 from lidarfw.io import read_points
-from lidarfw.types import Boxes, FrameMeta, Points, Poses
+from lidarfw.types import Boxes, Camera, FrameMeta, Image, Points, Poses
 
 if TYPE_CHECKING:
     import torch
@@ -153,6 +153,18 @@ def read_scan(path: Path) -> Points:
     if low < 0 or high > 1:
         raise DataError(f"{path}: remission: expected 0..1, found {low:g}..{high:g}. Is it a scan of 4 columns?")
     return Points.from_scan(torch.tensor(scan.xyz), torch.tensor(scan.features))
+
+
+def scaled_image(picture: npt.NDArray[np.uint8], camera: Camera, scale: float, path: Path) -> Image:
+    """A picture (H, W, 3) of a file as a batch of one, resized; DataError where the camera has another size."""
+    import cv2
+
+    if picture.shape[:2] != (camera.height, camera.width):
+        found = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise DataError(f"{path}: expected {camera.width} x {camera.height} pixels (the calibration), found {found}")
+    small = camera.scaled(scale)
+    resized = cv2.resize(picture, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    return Image(torch.tensor(resized.transpose(2, 0, 1)[None]).float() / 255, (small,))
 
 
 def pose_of(drive: Drive, place: int) -> Poses | None:

@@ -11,21 +11,25 @@ import functools
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lidarfw import kitti
-from lidarfw._lazy import LazyModule
-from lidarfw.components.datasets.drives import Array, Drive, DriveDataset, inverse, pose_of, read_table, rigid, scans_in
+from lidarfw.components.datasets.drives import (
+    Array,
+    Drive,
+    DriveDataset,
+    inverse,
+    pose_of,
+    read_table,
+    rigid,
+    scaled_image,
+    scans_in,
+)
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.io import read_image
 from lidarfw.types import Camera, DataSpec, Frame, FrameMeta, Image, Points, Poses, Spec, Targets
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = LazyModule("torch")
 
 _PERIOD = 0.1  # seconds between scans without time stamps
 _USUAL = {  # for the spec, which is asked before the calibration is there
@@ -154,7 +158,8 @@ class Kitti360Dataset(DriveDataset):
         inputs: dict[str, Any] = {"points": self.points(drive, place)} | ({"pose": pose} if self.pose else {})
         for name in self.images:
             path = self._pictures(drive.name, name) / f"{drive.scans[place].stem}.png"
-            inputs[name] = self._image(path, self._camera_of(name, meta.cameras))
+            camera = self._camera_of(name, meta.cameras)
+            inputs[name] = scaled_image(read_image(path), camera, self.image_scale, path)
         return Frame(inputs, Targets(poses=pose), meta)
 
     def _pictures(self, drive: str, name: str) -> Path:
@@ -164,19 +169,6 @@ class Kitti360Dataset(DriveDataset):
         if name not in cameras:
             raise DataError(f"{self.folder / 'calibration'}: has no calibration of {name}, an input of the dataset")
         return cameras[name]
-
-    def _image(self, path: Path, camera: Camera) -> Image:
-        import cv2
-
-        picture = read_image(path)
-        if picture.shape[:2] != (camera.height, camera.width):
-            found = f"{picture.shape[1]} x {picture.shape[0]}"
-            raise DataError(
-                f"{path}: expected {camera.width} x {camera.height} pixels (the calibration), found {found}"
-            )
-        scaled = camera.scaled(self.image_scale)
-        picture = cv2.resize(picture, (scaled.width, scaled.height), interpolation=cv2.INTER_AREA)
-        return Image(torch.tensor(picture.transpose(2, 0, 1)[None]).float() / 255, (scaled,))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

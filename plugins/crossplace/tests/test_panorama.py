@@ -71,6 +71,16 @@ def rig() -> tuple[Camera, Camera]:
     return tuple(Camera("mei", 1200, 1200, (450, 450, 599.5, 599.5), (1.0,), m) for m in (left, right))  # type: ignore[return-value]
 
 
+def ladybug() -> tuple[Camera, ...]:
+    """Five pinholes that look all round, each on its side: right of a picture is down."""
+    turns = [math.radians(72 * number) for number in range(5)]
+    axes = [((0, 0, -1.0, 0), (-math.sin(a), math.cos(a), 0, 0), (math.cos(a), math.sin(a), 0, 0)) for a in turns]
+    return tuple(Camera("pinhole", 1616, 1232, (400, 400, 808, 616), (), (*rows, (0, 0, 0, 1.0))) for rows in axes)
+
+
+RIGS = {"fisheyes": (rig(), math.radians(185)), "ladybug": (ladybug(), 1.75)}
+
+
 def lit(cameras: tuple[Camera, ...], point: tuple[float, float, float]) -> list[torch.Tensor]:
     """Black pictures with a bright spot where the point is."""
     pictures = [torch.zeros(3, camera.height, camera.width) for camera in cameras]
@@ -82,14 +92,15 @@ def lit(cameras: tuple[Camera, ...], point: tuple[float, float, float]) -> list[
     return pictures
 
 
+@pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize(("degrees", "column"), [(90, 256), (0, 512), (-90, 768), (30, 426)])
-def test_both_sensors_see_a_beacon_in_the_same_column(degrees: float, column: int) -> None:
+def test_both_sensors_see_a_beacon_in_the_same_column(degrees: float, column: int, name: str) -> None:
     beacon = (20 * math.cos(math.radians(degrees)), 20 * math.sin(math.radians(degrees)), -3.0)
-    cameras = rig()
+    cameras, fov = RIGS[name]
     pictures = lit(cameras, beacon)
-    inputs = {f"image_0{i + 2}": Image(p[None], (c,)) for i, (p, c) in enumerate(zip(pictures, cameras, strict=True))}
+    inputs = {f"camera_{i}": Image(p[None], (c,)) for i, (p, c) in enumerate(zip(pictures, cameras, strict=True))}
+    transform, found = Panorama(maps=("intensity",), cameras=tuple(inputs), fov=fov), []
     inputs["points"] = Points.from_scan(torch.tensor([beacon]), torch.ones(1, 1))  # type: ignore[assignment]
-    transform, found = Panorama(maps=("intensity",)), []
     for modality in ("camera", "lidar"):
         frame = Frame(inputs, Targets(), FrameMeta("f", modality=modality))
         bright = transform(frame, np.random.default_rng(0)).inputs["intensity"].features[0, 0]
@@ -99,6 +110,11 @@ def test_both_sensors_see_a_beacon_in_the_same_column(degrees: float, column: in
     (row, at), (other_row, other) = found
     assert abs(at - other) <= 1
     assert abs(row - other_row) <= 1
+
+
+def test_five_pictures_cover_the_panorama_of_an_hdl32() -> None:
+    view = RangeView(32, 1024, 0.1866, -0.5353)
+    assert panorama.stitcher(view, *RIGS["ladybug"]).covered.all()
 
 
 def test_two_fisheyes_cover_the_panorama_and_blend_over_their_overlap() -> None:

@@ -1,4 +1,4 @@
-"""The cameras of the vehicle: KITTI's pinhole, and KITTI-360's rig with two fisheyes.
+"""The cameras of the vehicle: KITTI's pinhole, KITTI-360's rig with two fisheyes, NCLT's Ladybug3.
 
 The cameras are lidarfw's `Camera`: `from_sensor` takes the frame of the LiDAR to that of the camera, so a camera says
 by itself where it stands. A picture of a frame (see `render.py`):
@@ -34,6 +34,7 @@ _KITTI = Camera("pinhole", 1242, 375, (721.5377, 721.5377, 609.5593, 172.854))
 _PERSPECTIVE = Camera("pinhole", 1408, 376, (552.0, 552.0, 682.0, 238.0))
 _LEFT = Camera("mei", 1400, 1400, (1336.0, 1335.5, 716.0, 706.0), (2.21, 0.016, 1.66, 4e-4, 4e-4))
 _RIGHT = Camera("mei", 1400, 1400, (1485.0, 1484.5, 699.0, 698.0), (2.55, 0.05, 4.5, 1.3e-3, -7e-4))
+_LADYBUG = Camera("pinhole", 1616, 1232, (400.0, 400.0, 812.0, 618.0))
 
 
 def kitti_camera(width: int = _KITTI.width) -> Camera:
@@ -61,6 +62,17 @@ def perspective_cameras(width: int = _PERSPECTIVE.width) -> dict[str, Camera]:
     down, ahead = (-math.sin(tilt), 0, -math.cos(tilt)), (math.cos(tilt), 0, -math.sin(tilt))
     places = {"image_00": (0.80, 0.30, -0.18), "image_01": (0.80, -0.30, -0.18)}
     return {name: _mounted(lens, (0, -1, 0), down, ahead, place) for name, place in places.items()}
+
+
+def ladybug_cameras(width: int = _LADYBUG.width) -> dict[str, Camera]:
+    """NCLT's: Cam1 to Cam5 every 72 degrees to the left, Cam5 ahead, right of a picture is down; Cam0 looks up."""
+    lens, middle = _scaled(_LADYBUG, width), np.array([0.033, -0.006, 0.273])
+    cameras = {"Cam0": _mounted(lens, (-1, 0, 0), (0, -1, 0), (0, 0, 1), middle)}
+    for number in range(1, 6):
+        turn = math.radians(72 * number)
+        ahead, left = np.array([math.cos(turn), math.sin(turn), 0]), (-math.sin(turn), math.cos(turn), 0)
+        cameras[f"Cam{number}"] = _mounted(lens, (0, 0, -1), left, ahead, middle + 0.042 * ahead)
+    return cameras
 
 
 def _scaled(camera: Camera, width: int) -> Camera:

@@ -22,11 +22,13 @@ from scipy.spatial import cKDTree
 
 from lidarfw_town import generate as generating
 from lidarfw_town.__main__ import main
+from lidarfw_town.camera import ladybug_cameras
 from lidarfw_town.drive import Drive, Object, TownFrame
 from lidarfw_town.generate import Job, drive_of, generate
 from lidarfw_town.layouts import LAYOUTS
 from lidarfw_town.layouts.kitti_360 import rig
 from lidarfw_town.layouts.nuscenes import cameras
+from lidarfw_town.render import photograph
 
 FRAMES, STRIDE, WIDTH = 3, 5, 120
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -36,7 +38,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "nuscenes": {"sweeps": 2},
     "kitti_360": {"images": ("image_00", "image_01", "image_02", "image_03"), "sweeps": 2},
     "oxford": {"boxes": True, "sweeps": 2},
-    "nclt": {"sweeps": 2},
+    "nclt": {"sweeps": 2, "images": ("Cam0", "Cam1", "Cam5")},
 }
 BOXED, POSED = ("kitti", "kitti_tracking", "nuscenes", "oxford"), [name for name in OPTIONS if name != "kitti"]
 
@@ -306,6 +308,19 @@ def test_kitti_360_calibration_is_that_of_the_rig(written: Job, dataset: Dataset
         assert (read.model, read.width, read.height) == (camera.model, camera.width, camera.height)
         assert np.array(read.from_sensor) == pytest.approx(np.array(camera.from_sensor), abs=1e-9)
         assert [*read.intrinsics, *read.distortion] == pytest.approx([*camera.intrinsics, *camera.distortion])
+
+
+def test_nclt_cameras_are_those_of_the_rig(written: Job, dataset: Dataset) -> None:
+    if written.layout != "nclt":
+        pytest.skip("of NCLT only")
+    frame, points = dataset[1], torch.randn(50, 3, dtype=torch.double) * 10
+    for name in ("Cam0", "Cam1", "Cam5"):
+        camera, read = ladybug_cameras(WIDTH)[name], frame.inputs[name].cameras[0]
+        (expected, _, seen), (found, _, _) = camera.project(points), read.project(points)
+        assert bool(seen.any())
+        assert (found - expected)[seen].abs().max() < 1e-3
+        shot = photograph(drive_of(written, 0), truth(written, 1), camera).image
+        assert torch.equal((frame.inputs[name].features[0] * 255).round().byte().permute(1, 2, 0), torch.tensor(shot))
 
 
 def test_nuscenes_tables(written: Job, dataset: Dataset) -> None:

@@ -84,7 +84,7 @@ def write_array(path: Path, values: Array | np.ndarray, kind: npt.DTypeLike = "<
         np.asarray(values).astype(kind).tofile(temporary)
 
 
-def write_png(path: Path, picture: np.ndarray) -> None:
+def write_picture(path: Path, picture: np.ndarray) -> None:
     """A picture (H, W, 3) of bytes, or (H, W) of bytes or 16-bit numbers."""
     from PIL import Image
 

@@ -20,7 +20,7 @@ from lidarfw.types import Camera
 from lidarfw_town.bodies import KINDS
 from lidarfw_town.camera import LIDAR_TO_CAMERA, kitti_camera, kitti_projection
 from lidarfw_town.drive import Drive, Object, TownFrame
-from lidarfw_town.layouts.base import FEWEST, Layout, Place, numbers, square, write_array, write_png
+from lidarfw_town.layouts.base import FEWEST, Layout, Place, numbers, square, write_array, write_picture
 from lidarfw_town.mesh import Array
 from lidarfw_town.render import photograph
 
@@ -46,7 +46,7 @@ class KittiLayout(Layout):
         labels = labels_of(frame.objects, camera)
         kitti.write_results(folder / "label_2" / f"{name}.txt", labels)
         if self.width:
-            write_png(folder / "image_2" / f"{name}.png", photograph(drive, frame, camera).image)
+            write_picture(folder / "image_2" / f"{name}.png", photograph(drive, frame, camera).image)
         return {"name": name}
 
     def _name(self, place: Place) -> str:
@@ -72,7 +72,7 @@ class KittiTrackingLayout(Layout):
         camera = camera_of(self.width)
         write_array(folder / "velodyne" / sequence / f"{name}.bin", frame.points)
         if self.width:
-            write_png(folder / "image_02" / sequence / f"{name}.png", photograph(drive, frame, camera).image)
+            write_picture(folder / "image_02" / sequence / f"{name}.png", photograph(drive, frame, camera).image)
         write_text(folder / "calib" / f"{sequence}.txt", calibration_text(camera, tracking=True))
         numbered = zip(_numbers(frame.objects, camera), labels_of(frame.objects, camera))
         lines = [f"{place.index} {number} {_tracking_line(label)}" for number, label in numbered]

@@ -14,7 +14,7 @@ from lidarfw.types import Camera
 
 from lidarfw_town.camera import fisheye_cameras, perspective_cameras, rays_of
 from lidarfw_town.drive import Drive, TownFrame
-from lidarfw_town.layouts.base import Layout, Place, numbers, write_array, write_png
+from lidarfw_town.layouts.base import Layout, Place, numbers, write_array, write_picture
 from lidarfw_town.mesh import Array
 from lidarfw_town.render import Rendering, photograph
 
@@ -70,11 +70,11 @@ class Kitti360Layout(Layout):
     def _pictures(self, name: str, camera: Camera, shot: Rendering, place: Place) -> None:
         drive, file = self.name(place.drive), f"{place.index:010d}.png"
         kind = "data_rgb" if camera.model == "mei" else "data_rect"
-        write_png(self.root / "data_2d_raw" / drive / name / kind / file, shot.image)
+        write_picture(self.root / "data_2d_raw" / drive / name / kind / file, shot.image)
         depth = np.minimum(np.round(shot.depth * 256), 2**16 - 1).astype(np.uint16)
-        write_png(self.root / "data_2d_depth" / drive / name / file, depth)
+        write_picture(self.root / "data_2d_depth" / drive / name / file, depth)
         semantic = labels_of(shot, np.asarray(rays_of(camera)[1].any(1)).reshape(shot.depth.shape))
-        write_png(self.root / "data_2d_semantics" / "train" / drive / name / "semantic" / file, semantic)
+        write_picture(self.root / "data_2d_semantics" / "train" / drive / name / "semantic" / file, semantic)
 
     def finish(self, parts: Sequence[Sequence[dict[str, Any]]]) -> None:
         cameras = rig(self.width or _FULL)

@@ -17,7 +17,7 @@ from lidarfw.nuscenes import CAMERAS, FROM_NUSCENES, LIDAR
 from lidarfw.types import Camera
 
 from lidarfw_town.drive import Drive, Object, TownFrame
-from lidarfw_town.layouts.base import Layout, Place, rings, write_array, write_png
+from lidarfw_town.layouts.base import Layout, Place, rings, write_array, write_picture
 from lidarfw_town.mesh import Array
 from lidarfw_town.render import photograph
 
@@ -69,7 +69,7 @@ class NuScenesLayout(Layout):
         write_array(self.root / files[LIDAR], table)
         for channel, camera in cameras(self.width).items() if key and self.width else ():
             files[channel] = self._file(channel, scene, time, key, "png")
-            write_png(self.root / files[channel], photograph(drive, frame, camera).image)
+            write_picture(self.root / files[channel], photograph(drive, frame, camera).image)
         objects = [_annotated(thing, frame.pose) for thing in frame.objects if thing.kind in _CATEGORIES]
         ego = frame.pose @ inverse(_MOUNT)
         return {"time": time, "key": key, "files": files, "ego": _placed(ego), "objects": objects if key else []}

@@ -12,7 +12,7 @@ from lidarfw.files import write_text
 
 from lidarfw_town.camera import LIDAR_TO_CAMERA, kitti_projection
 from lidarfw_town.drive import Drive, TownFrame
-from lidarfw_town.layouts.base import Layout, Place, numbers, square, write_array, write_png
+from lidarfw_town.layouts.base import Layout, Place, numbers, square, write_array, write_picture
 from lidarfw_town.layouts.kitti import camera_of
 from lidarfw_town.mesh import Array
 from lidarfw_town.render import photograph
@@ -31,7 +31,7 @@ class SemanticKittiLayout(Layout):
         write_array(folder / "velodyne" / f"{name}.bin", frame.points)
         write_array(folder / "labels" / f"{name}.label", frame.label, "<u4")
         if self.width:
-            write_png(folder / "image_2" / f"{name}.png", photograph(drive, frame, camera_of(self.width)).image)
+            write_picture(folder / "image_2" / f"{name}.png", photograph(drive, frame, camera_of(self.width)).image)
         return {"pose": frame.pose.tolist(), "time": frame.time}
 
     def _folder(self, drive: int) -> Path:
