@@ -29,6 +29,7 @@ from torch import Tensor
 log = logging.getLogger(__name__)
 KINDS = ("flat", "hnsw", "ivf_pq")
 _TRIED = 256  # queries of the report on an approximate index
+_PLACES_A_CELL = 64  # at most that the cells of ivf_pq are learnt from: a million places take a quarter of the time
 _ROWS = 1000  # at a time, to and from a database
 
 
@@ -163,7 +164,10 @@ class FaissRetriever(Retriever):
         if count < 256:
             raise DataError(f"ivf_pq learns 256 codes a part and needs as many places, the map has {count}: kind=flat")
         cells = self.cells or max(int(4 * count**0.5), 1)
-        return faiss.IndexIVFPQ(faiss.IndexFlatL2(width), width, min(cells, count // 39 or 1), self.code_bytes, 8)
+        cells = min(cells, count // 39 or 1)
+        engine = faiss.IndexIVFPQ(faiss.IndexFlatL2(width), width, cells, self.code_bytes, 8)
+        engine.cp.max_points_per_centroid = _PLACES_A_CELL
+        return engine
 
     @torch.no_grad()
     def query(self, index: FaissIndex, descriptors: Descriptors, k: int) -> Matches:
