@@ -16,7 +16,7 @@ from lidarfw.claims.judging import CONTRADICTED, MEANING, NEUTRAL, SUPPORTED, UN
 from lidarfw.claims.reading import Claim, ClaimsFile
 from lidarfw.claims.running import Work, commit
 from lidarfw.draw import COLOURS
-from lidarfw.errors import DataError
+from lidarfw.errors import ConfigError, DataError
 from lidarfw.files import atomic_path, write_text
 
 _COLOUR = {SUPPORTED: COLOURS[2], CONTRADICTED: COLOURS[1], NEUTRAL: COLOURS[0], UNDECIDED: COLOURS[7]}
@@ -27,16 +27,20 @@ def outcomes(stated: ClaimsFile, work: Work, claims: Sequence[Claim], recorded: 
     """An entry for every claim: judged now, or as recorded earlier, or without an outcome.
 
     `recorded` are the entries of an earlier JSON file, by claim. One stands in where the runs are not there (any
-    more, or not on this machine) and the claim has not been changed since.
+    more, or not on this machine) and the claim has not been changed since. A claim whose runs cannot be compared has
+    the reason as its `fault`.
     """
-    entries = []
-    for claim in stated.claims:
-        found = _judged(claim, work) if claim in claims else None
-        old = recorded.get(claim.name)
-        if found is None and old is not None and old["definition"] == definition(claim):
-            found = old
-        entries.append(found or {"name": claim.name, "definition": definition(claim), "outcome": None, "runs": []})
-    return entries
+    return [_entry(claim, work if claim in claims else None, recorded.get(claim.name)) for claim in stated.claims]
+
+
+def _entry(claim: Claim, work: Work | None, old: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    empty: dict[str, Any] = {"name": claim.name, "definition": definition(claim), "outcome": None, "runs": []}
+    try:
+        found = _judged(claim, work) if work else None
+    except ConfigError as error:
+        return empty | {"fault": str(error)}
+    unchanged = old is not None and old["definition"] == definition(claim)
+    return found or (old if old is not None and unchanged else empty)
 
 
 def definition(claim: Claim) -> dict[str, Any]:
@@ -102,12 +106,14 @@ def text(stated: ClaimsFile, entries: Sequence[Mapping[str, Any]], command: str)
     """The table as Markdown."""
     done = [entry for entry in entries if entry["outcome"]]
     counts = [f"{sum(e['outcome']['verdict'] == verdict for e in done)} {verdict}" for verdict in MEANING]
-    missing = len(entries) - len(done)
+    faulty = sum("fault" in entry for entry in entries)
+    missing = len(entries) - len(done) - faulty
+    counts += [f"{missing} not run"] * bool(missing) + [f"{faulty} not judged"] * bool(faulty)
     parts = [
         "---\norphan: true\n---\n",  # for Sphinx: a page of no table of contents
         f"# Claims: {stated.name}\n",
         f"{stated.paper}\n" if stated.paper else "",
-        f"{', '.join(counts)}{f', {missing} not run' if missing else ''}.\n",
+        f"{', '.join(counts)}.\n",
         f"![differences with their intervals]({stated.name}.png)\n" if done else "",
         _table(entries),
         _how(stated, done, command),
@@ -129,7 +135,8 @@ def _row(entry: Mapping[str, Any]) -> list[str]:
     first = [claim["text"], claim["source"] or "-", f"`{claim['metric']}` {arrow}"]
     found = entry["outcome"]
     if found is None:
-        return [*first, *names, "-", "-", "not run" + " (long)" * claim["long"]]
+        why = "not judged" if "fault" in entry else "not run" + " (long)" * claim["long"]
+        return [*first, *names, "-", "-", why]
     values = [f"{name}: {found[key]:.4g}" for name, key in zip(names, ("baseline", "variant"), strict=True)]
     difference = f"{found['difference']:+.4g} [{found['low']:+.4g}, {found['high']:+.4g}]"
     sign = 1 if claim["better"] == "higher" else -1

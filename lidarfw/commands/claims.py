@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run, judge, write; 1 where a run failed."""
+    """Run, judge, write; 1 where a run failed or runs cannot be compared."""
     from lidarfw.claims import reporting
     from lidarfw.claims.reading import find, read
     from lidarfw.claims.running import Runner, Work
@@ -57,10 +57,12 @@ def run(args: argparse.Namespace) -> int:
     entries = reporting.outcomes(stated, work, chosen, recorded)
     page = reporting.write(Path(args.output), stated, entries, _command(args))
     for entry in entries:
-        verdict = entry["outcome"]["verdict"] if entry["outcome"] else "not run"
-        print(f"{verdict:<13} {entry['definition']['text']}")
+        without = "not judged" if "fault" in entry else "not run"
+        print(f"{entry['outcome']['verdict'] if entry['outcome'] else without:<13} {entry['definition']['text']}")
     print(f"\n{page}")
-    return _say_what_is_left(runner, todo)
+    faults = [entry["fault"] for entry in entries if "fault" in entry]
+    print("".join(f"{fault}\n" for fault in faults), file=sys.stderr, end="")
+    return max(_say_what_is_left(runner, todo), int(bool(faults)))
 
 
 def _check_numbers(args: argparse.Namespace) -> None:

@@ -235,6 +235,19 @@ def test_a_run_that_fails_is_named_and_the_others_go_on(file, tmp_path, start, c
     assert table_of(tmp_path / "out")["Another name and a delay are worse"] == "**supported**"
 
 
+def test_a_claim_that_cannot_be_judged_does_not_take_the_others_along(file, tmp_path, start, capsys):
+    text = file.read_text().replace("eval: [filter=delay]", "eval: [dataset.toy.frames=12]")
+    file.write_text(text.replace("seeds: [1, 2]", "seeds: [1]"))
+    out = tmp_path / "out"
+    assert main(["claims", str(file), "-o", str(out), "--runs", str(tmp_path / "runs")]) == 1
+    printed = capsys.readouterr()
+    assert "claims.delaying: the runs were not evaluated on the same frames: 24 and 12" in printed.err
+    assert "not judged    Another name and a delay are worse" in printed.out
+    assert table_of(out)["Another name and a delay are worse"] == "not judged"
+    assert table_of(out)["Training helps"] == "**supported**"
+    assert "1 not judged." in (out / "toy.md").read_text()
+
+
 def test_only_one_process_makes_a_run(file, tmp_path, start):
     stated = reading.read(file)
     work = running.Work(stated, [replace(stated.claims[0], baseline=0.5, seeds=(1,))], tmp_path / "runs")
