@@ -206,15 +206,6 @@ def test_no_data_is_black_and_road_is_not() -> None:
     assert colours[:, 0, 0].tolist() == pytest.approx([128 / 255, 64 / 255, 128 / 255])
 
 
-def test_polynomial_alignment() -> None:
-    u, v = np.meshgrid([0.0, 1, 2], [0.0, 1, 2])
-    place = np.stack([u.ravel(), v.ravel()], 1)
-    target = 1 + 0.5 * place[:, 0] - 0.25 * place[:, 1] + 0.1 * place[:, 0] ** 2 + 0.05 * place.prod(1)
-    assert panorama.fit_polynomial(place, target, 2).tolist() == pytest.approx([1, 0.5, -0.25, 0.1, 0.05, 0], abs=1e-9)
-    with pytest.raises(DataError, match="10 coefficients"):
-        panorama.fit_polynomial(place[:5], target[:5], 3)
-
-
 def test_own_vehicle_is_filled_and_its_classes_are_road(tmp_path: Path) -> None:
     from lidarfw.draw import write_png
 
