@@ -128,7 +128,7 @@ class Panorama(Transform):
             from lidarfw.draw import write_png
 
             steps = np.linspace(0, len(dataset) - 1, min(len(dataset), _EGO_FRAMES)).round().astype(int)
-            greys = torch.stack([self._grey(dataset[int(number)]) for number in np.unique(steps)])
+            greys = torch.stack([self._seen(dataset[int(number)]) for number in np.unique(steps)])
             still = (greys.std(0, correction=0) < _EGO_MOVES) & (greys.mean(0) > 0)
             write_png(self.ego_mask, np.repeat((still[0].numpy() * np.uint8(255))[..., None], 3, 2))
         if self._asked:
@@ -184,6 +184,13 @@ class Panorama(Transform):
         """(N,) unified class of every point."""
         if frame.targets.points is not None and self.classes:
             return labels.table_of((*self.classes, "unlabeled"))[frame.targets.points.label]
+        missing = [f"{name}_semantics" for name in self.cameras if f"{name}_semantics" not in frame.inputs]
+        if missing:
+            raise DataError(
+                f"frame {frame.meta.id}: transform 'panorama' finds no classes of its points: they have no labels, and "
+                f"there is no input {missing[0]}\n"
+                "  fix: data with classes of points, or a model without the map semantics"
+            )
         xyz, found = frame.inputs["points"].xyz, torch.full((len(frame.inputs["points"]),), labels.UNKNOWN)
         for name in self.cameras:
             picture: Image = frame.inputs[f"{name}_semantics"]
@@ -265,9 +272,13 @@ class Panorama(Transform):
         rig = tuple(image.cameras[0] for image in images)
         return panorama.stitcher(view or self.view, rig, self.fov), [image.features[0] for image in images]
 
-    def _grey(self, frame: Frame) -> Tensor:
+    def _seen(self, frame: Frame) -> Tensor:
+        """(1, H, W) grey values, own vehicle and all."""
         stitcher, pictures = self._pictures(frame)
-        return self._filled(panorama.grey(stitcher.blend(pictures)))
+        return panorama.grey(stitcher.blend(pictures))
+
+    def _grey(self, frame: Frame) -> Tensor:
+        return self._filled(self._seen(frame))
 
     def _depth(self, frame: Frame, rng: np.random.Generator, said: networks.Said) -> Tensor:
         if said.depth is not None:
@@ -297,6 +308,11 @@ class Panorama(Transform):
     def _own_vehicle(self) -> Tensor:
         from lidarfw.io import read_image
 
+        if not Path(self.ego_mask).is_file():
+            raise DataError(
+                f"{self.ego_mask}: the mask of the own vehicle is not there (transform.panorama.ego_mask)\n"
+                "  fix: lidarfw prepare with the overrides of the training makes it, in the folder that this runs in"
+            )
         picture = read_image(Path(self.ego_mask))
         if picture.shape[:2] != (self.view.height, self.view.width):
             raise DataError(
@@ -308,7 +324,7 @@ class Panorama(Transform):
     @property
     def _ego(self) -> Tensor:
         """(H, W) bool: pixel shows the own vehicle."""
-        if not self.ego_mask or not Path(self.ego_mask).is_file():
+        if not self.ego_mask:
             return torch.zeros(self.view.height, self.view.width, dtype=torch.bool)
         return self._own_vehicle
 
