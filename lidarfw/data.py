@@ -382,15 +382,12 @@ class DataModule(pl.LightningDataModule):
     def prepare_data(self) -> None:
         """Let datasets and transforms get their files ready; Lightning calls this on one process per node."""
         for name, dataset in self.datasets.items():
-            dataset.prepare()
-            for transform in self.transforms[name]:
-                transform.prepare(dataset, max(self.workers, 1))
+            _prepare(dataset, self.transforms[name], max(self.workers, 1))
 
     def setup(self, stage: str) -> None:
         """Tell the transforms which dataset they work on."""
         for name, dataset in self.datasets.items():
-            for transform in self.transforms[name]:
-                transform.attach(dataset)
+            _attach(dataset, self.transforms[name])
 
     def train_dataloader(self) -> FrameLoader:
         """Every clip once per epoch, in the order of (seed, epoch)."""
@@ -477,6 +474,32 @@ class DataModule(pl.LightningDataModule):
     def world(self) -> int:
         """Processes of the run."""
         return self.trainer.world_size if self.trainer else 1
+
+
+def _prepare(dataset: Dataset, transforms: Sequence[Transform], workers: int = 1) -> None:
+    dataset.prepare()
+    for transform in transforms:
+        transform.prepare(dataset, workers)
+
+
+def _attach(dataset: Dataset, transforms: Sequence[Transform]) -> None:
+    for transform in transforms:
+        transform.attach(dataset)
+
+
+def make_ready(dataset: Dataset, transforms: Sequence[Transform]) -> None:
+    """Get the files of a dataset and its transforms ready, and tell these what they work on, as a `DataModule` does."""
+    _prepare(dataset, transforms)
+    _attach(dataset, transforms)
+
+
+def evaluation_data(config: Mapping[str, Any] | DictConfig, split: str) -> tuple[Dataset, list[Transform]]:
+    """The dataset of a config for one split and its transforms of evaluation, ready to be read one by one."""
+    from lidarfw.assembly import make_dataset, make_transforms
+
+    dataset, transforms = make_dataset(config, split), make_transforms(config, training=False)
+    make_ready(dataset, transforms)
+    return dataset, transforms
 
 
 def _at_least(key: str, value: Any, least: int) -> Any:

@@ -14,8 +14,9 @@ import numpy as np
 import torch
 
 from lidarfw import draw, kitti
-from lidarfw.assembly import make_dataset, make_transforms
+from lidarfw.assembly import make_transforms
 from lidarfw.components.datasets.drives import read_table
+from lidarfw.data import evaluation_data
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.files import atomic_path, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
@@ -222,9 +223,7 @@ class SplitFrames(Sequence[Frame]):
         config = model.plan.config
         if not config.get("dataset"):
             raise ConfigError("the checkpoint names no dataset, so it has no splits\n  fix: give scans instead")
-        self.dataset = make_dataset(config, config.get("splits", {}).get(split, split))
-        self.dataset.prepare()
-        self.transforms = make_transforms(config, training=False)
+        self.dataset, self.transforms = evaluation_data(config, config.get("splits", {}).get(split, split))
 
     def __len__(self) -> int:
         return len(self.dataset)

@@ -199,11 +199,25 @@ class PerceptionModule(pl.LightningModule):
     def _log_metrics(self, stage: str) -> None:
         if self._stream is not None and not self._idle:
             self._count(self._stream.flush())
-        figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
+        try:
+            figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
+        except ConfigError as error:
+            if not self._partial(stage):
+                raise
+            _say(f"no figures of a part of the {stage} data: {error}")
+            return
         for name, value in figures.items():
             self.log(name, value, prog_bar=name == self.monitor, sync_dist=True)
         if not self.trainer.sanity_checking:
             self.figures = figures
+
+    def _partial(self, stage: str) -> bool:
+        """Whether only some batches were evaluated: they need not hold all that a metric compares, such as a map."""
+        if self.trainer.sanity_checking:
+            return True
+        test = stage == "test"
+        loader = self.trainer.test_dataloaders if test else self.trainer.val_dataloaders
+        return sum(self.trainer.num_test_batches if test else self.trainer.num_val_batches) < len(loader or ())
 
     test_step = validation_step
     on_test_epoch_start = on_validation_epoch_start

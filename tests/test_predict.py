@@ -282,3 +282,9 @@ def test_real_scan_with_its_picture(checkpoint: Path, real_data: Callable[[str],
 def test_missing_calibration_of_a_picture(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no file in this folder"):
         find_sources([tmp_path], lidar=False)
+
+
+def test_transforms_of_a_split_know_its_dataset(tmp_path: Path, told: list[str]) -> None:
+    path = write_checkpoint(tmp_path / "told.ckpt", *SMALL, "dataset.synthetic.frames=2", *told)
+    assert cli(path, "--split", "val", "-o", tmp_path / "out") == 0
+    assert len(list((tmp_path / "out").glob("*.json"))) == 2

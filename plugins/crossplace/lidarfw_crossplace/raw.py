@@ -11,7 +11,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import torch
-from lidarfw import assembly, config
+from lidarfw import config
+from lidarfw.data import evaluation_data
 from lidarfw.types import BEV, Descriptors, Frame, Image, Spec
 from omegaconf import OmegaConf
 from rich.progress import track
@@ -41,11 +42,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="those of the training")
     settings = config.compose(parser.parse_args().overrides)
-    dataset = assembly.make_dataset(settings, settings.splits.test)
-    dataset.prepare()
-    transforms = assembly.make_transforms(settings, training=False)
-    for transform in transforms:
-        transform.attach(dataset)
+    dataset, transforms = evaluation_data(settings, settings.splits.test)
 
     def changed(number: int) -> Frame:
         frame = dataset[number]

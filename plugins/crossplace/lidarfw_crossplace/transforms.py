@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -127,21 +128,21 @@ class Panorama(Transform):
             from lidarfw.draw import write_png
 
             steps = np.linspace(0, len(dataset) - 1, min(len(dataset), _EGO_FRAMES)).round().astype(int)
-            greys = torch.stack([self._grey(dataset[int(number)]) for number in np.unique(steps)])
+            greys = torch.stack([self._seen(dataset[int(number)]) for number in np.unique(steps)])
             still = (greys.std(0, correction=0) < _EGO_MOVES) & (greys.mean(0) > 0)
             write_png(self.ego_mask, np.repeat((still[0].numpy() * np.uint8(255))[..., None], 3, 2))
-        if any(self.networks.values()):
+        if self._asked:
             self._ask_all(dataset, workers)
 
     def _ask_all(self, dataset: Dataset, workers: int) -> None:
         """Ask the networks about every frame that is not in the cache, `workers` frames at a time."""
         from rich.progress import track
 
-        metas = [dataset.meta(number) for number in range(len(dataset))]
+        metas, settings = [dataset.meta(number) for number in range(len(dataset))], self._settings()
         missing = [
             number
             for number, meta in enumerate(metas)
-            if meta.modality != "lidar" and not networks.file_of(self.cache, meta.id).is_file()
+            if meta.modality != "lidar" and not networks.kept(networks.file_of(self.cache, meta.id), settings)
         ]
         work = torch.utils.data.DataLoader(  # its processes are started, fed and ended by torch
             networks.Work(self, dataset, missing), None, num_workers=workers if workers > 1 else 0
@@ -183,6 +184,13 @@ class Panorama(Transform):
         """(N,) unified class of every point."""
         if frame.targets.points is not None and self.classes:
             return labels.table_of((*self.classes, "unlabeled"))[frame.targets.points.label]
+        missing = [f"{name}_semantics" for name in self.cameras if f"{name}_semantics" not in frame.inputs]
+        if missing:
+            raise DataError(
+                f"frame {frame.meta.id}: transform 'panorama' finds no classes of its points: they have no labels, and "
+                f"there is no input {missing[0]}\n"
+                "  fix: data with classes of points, or a model without the map semantics"
+            )
         xyz, found = frame.inputs["points"].xyz, torch.full((len(frame.inputs["points"]),), labels.UNKNOWN)
         for name in self.cameras:
             picture: Image = frame.inputs[f"{name}_semantics"]
@@ -203,14 +211,28 @@ class Panorama(Transform):
 
     def said(self, frame: Frame) -> networks.Said:
         """What networks say of the pictures of a frame: from the cache, else asked now and kept."""
-        if not any(self.networks.values()):
+        if not self._asked:
             return networks.Said()
-        path, settings = networks.file_of(self.cache, frame.meta.id), f"{self.networks} {self.view} {self.sphere}"
+        path, settings = networks.file_of(self.cache, frame.meta.id), self._settings()
         if path.is_file():
             return networks.Said.load(path, settings)
         said = self._ask(frame)
         said.save(path, settings)
         return said
+
+    @property
+    def _asked(self) -> list[str]:
+        """The maps that come from networks."""
+        answering = {"intensity": "inpaint", "depth": "depth", "semantics": "semantics"}
+        return [name for name in CHANNELS if name in self.maps and self.networks[answering[name]]]
+
+    def _settings(self) -> str:
+        """All that an answer depends on; of the own vehicle its mask, whatever its file is called."""
+        mask = hashlib.blake2b(self._ego.numpy().tobytes(), digest_size=8).hexdigest()
+        return (
+            f"{', '.join(self._asked)} by {self.networks} in {self.view} of {self.sphere} columns, cameras "
+            f"{', '.join(self.cameras)} of {self.fov} radians, own vehicle {mask} filled by {self.ego_fill}"
+        )
 
     def _ask(self, frame: Frame) -> networks.Said:
         """Let the networks look at the whole stitched panorama, and cut out what the LiDAR sees."""
@@ -218,13 +240,13 @@ class Panorama(Transform):
         stitcher, pictures = self._pictures(frame, view=whole)
         picture, crop = stitcher.blend(pictures), panorama.stitcher(self.view, (panorama.camera_of(whole),), math.pi)
         said = networks.Said()
-        if self._depth_network and "depth" in self.maps:
+        if "depth" in self._asked:
             inverse = crop.blend([self._depth_network(picture)[None]])[0]
             covered = crop.blend([stitcher.covered[None].float()])[0] > 0.5
             said.depth = self._filled(panorama.depth_from_inverse(inverse, covered & ~self._ego)[None])[0]
-        if self._semantics_network and "semantics" in self.maps:
+        if "semantics" in self._asked:
             said.classes = crop.pick([self._semantics_network(picture)[None].float()])[0].to(torch.uint8)
-        if self._inpaint_network and "intensity" in self.maps:
+        if "intensity" in self._asked:
             said.intensity = self._grey(frame)[0]
         return said
 
@@ -250,9 +272,13 @@ class Panorama(Transform):
         rig = tuple(image.cameras[0] for image in images)
         return panorama.stitcher(view or self.view, rig, self.fov), [image.features[0] for image in images]
 
-    def _grey(self, frame: Frame) -> Tensor:
+    def _seen(self, frame: Frame) -> Tensor:
+        """(1, H, W) grey values, own vehicle and all."""
         stitcher, pictures = self._pictures(frame)
-        return self._filled(panorama.grey(stitcher.blend(pictures)))
+        return panorama.grey(stitcher.blend(pictures))
+
+    def _grey(self, frame: Frame) -> Tensor:
+        return self._filled(self._seen(frame))
 
     def _depth(self, frame: Frame, rng: np.random.Generator, said: networks.Said) -> Tensor:
         if said.depth is not None:
@@ -282,6 +308,11 @@ class Panorama(Transform):
     def _own_vehicle(self) -> Tensor:
         from lidarfw.io import read_image
 
+        if not Path(self.ego_mask).is_file():
+            raise DataError(
+                f"{self.ego_mask}: the mask of the own vehicle is not there (transform.panorama.ego_mask)\n"
+                "  fix: lidarfw prepare with the overrides of the training makes it, in the folder that this runs in"
+            )
         picture = read_image(Path(self.ego_mask))
         if picture.shape[:2] != (self.view.height, self.view.width):
             raise DataError(
@@ -293,7 +324,7 @@ class Panorama(Transform):
     @property
     def _ego(self) -> Tensor:
         """(H, W) bool: pixel shows the own vehicle."""
-        if not self.ego_mask or not Path(self.ego_mask).is_file():
+        if not self.ego_mask:
             return torch.zeros(self.view.height, self.view.width, dtype=torch.bool)
         return self._own_vehicle
 

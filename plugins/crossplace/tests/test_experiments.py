@@ -8,7 +8,10 @@ from pathlib import Path
 import lidarfw
 import numpy as np
 import pytest
+import torch
 from lidarfw import config, predict
+from lidarfw.assembly import build, plan
+from lidarfw.checkpoint import describe
 from lidarfw.cli import main
 from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.data import PairOrder
@@ -158,6 +161,33 @@ def test_a_branch_is_judged_though_fusion_replaces_it(tmp_path: Path) -> None:
     whole = evaluate(checkpoint)
     alone = evaluate(checkpoint, ["metric.place_recall.inputs.descriptors=head.place"])
     assert alone == pytest.approx(whole)  # fused of this branch alone
+    with pytest.raises(ConfigError, match=r"is of the map\n  fix: "):
+        evaluate(checkpoint, ["metric.place_recall.map_sequences=[elsewhere]"])
     model = lidarfw.load(checkpoint)
     result = next(iter(predict.predict_frames(model, [predict.SplitFrames(model, "val")[0]])))
     assert list(result.predictions) == ["head.late_fusion"]
+
+
+def test_a_split_is_described_with_the_classes_of_its_points(tmp_path: Path) -> None:
+    options = [
+        "dataset=synthetic", "dataset.synthetic.frames=2", "transform=panorama", "transform.panorama.maps=[semantics]",
+        "transform.panorama.height=16", "transform.panorama.width=64", "backbone=cosplace_small", "~neck",
+        "head=place_small", "loss=tsap", "metric=place_recall",
+    ]  # fmt: skip
+    wired = plan(config.compose(options))
+    weights = {f"model.{name}": value for name, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "a.ckpt")
+    command = ["index", "build", str(tmp_path / "a.ckpt"), "--split", "val", "-o", str(tmp_path / "map.npz")]
+    assert main(command) == 0
+
+
+@pytest.mark.parametrize("part", ["debug=fast", "trainer.limit_val_batches=1"])
+def test_a_part_of_a_split_may_lack_the_map(part: str, tmp_path: Path) -> None:
+    options = (
+        "dataset=either_sensor dataset.either_sensor.of=synthetic +dataset.either_sensor.options={frames:4,image:true} "
+        "transform=panorama transform.panorama.maps=[intensity] transform.panorama.cameras=[image] "
+        "transform.panorama.height=16 transform.panorama.width=64 backbone=cosplace_small ~neck head=place_small "
+        "head.place.channels=8 loss=tsap metric=place_recall metric.place_recall.map_sequences=[later] "
+        f"loader.batch_size=4 trainer.max_epochs=1 trainer.accelerator=cpu logger=none hydra.run.dir={tmp_path}"
+    )
+    assert main(["train", *options.split(), part]) == 0

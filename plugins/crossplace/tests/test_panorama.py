@@ -253,3 +253,18 @@ def test_views_are_moved_by_metres() -> None:
     moved = turned(bev, 0.0, (1.0, -0.5)).features
     assert torch.allclose(moved[..., 1:, :-2], bev.features[..., :-1, 2:], atol=1e-5)
     assert torch.equal(turned(bev, 0.0).features, turned(bev, 0.0, (0.0, 0.0)).features)
+
+
+def test_classes_of_points_and_a_mask_that_are_not_there_are_asked_for(tmp_path: Path) -> None:
+    scan = Frame(
+        {"points": Points.from_scan(torch.rand(5, 3) * 20, torch.rand(5, 1))},
+        Targets(),
+        FrameMeta("f", modality="lidar"),
+    )
+    with pytest.raises(DataError, match="no input image_02_semantics\n  fix: "):
+        Panorama(maps=("semantics",))(scan, np.random.default_rng(0))
+    pictures = {f"image_0{i + 2}": Image(torch.rand(1, 3, 1200, 1200), (c,)) for i, c in enumerate(rig())}
+    frame = Frame(dict(pictures), Targets(), FrameMeta("f", modality="camera"))
+    masked = Panorama(maps=("intensity",), ego_mask=str(tmp_path / "ego.png"))
+    with pytest.raises(DataError, match=r"ego\.png.*is not there.*\n  fix: lidarfw prepare"):
+        masked(frame, np.random.default_rng(0))

@@ -19,9 +19,9 @@ from typing import Any
 import lidarfw
 import numpy as np
 import torch
-from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.checkpoint import config_of, description, read
 from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
+from lidarfw.data import evaluation_data
 from lidarfw.errors import DataError
 from lidarfw.evaluation import evaluation_config
 from lidarfw.files import write_text
@@ -103,8 +103,7 @@ def predictions(checkpoint: Path, overrides: Sequence[str], past: int = 0) -> It
     about = description(read(checkpoint), checkpoint)
     config = evaluation_config(config_of(about, checkpoint), list(overrides))
     model = lidarfw.load(checkpoint)
-    dataset, transforms = make_dataset(config, config.splits.test), make_transforms(config, training=False)
-    dataset.prepare()
+    dataset, transforms = evaluation_data(config, config.splits.test)
     for place, index in itertools.chain.from_iterable(map(enumerate, dataset.sequences())):
         frame = dataset[index]
         for change in transforms:

@@ -26,15 +26,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from lidarfw import checkpoint
-from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.components.metrics.box_ap import BoxAP
 from lidarfw.components.postprocessors.nms import NMS
-from lidarfw.config import to_plain
+from lidarfw.data import evaluation_data
 from lidarfw.errors import ConfigError, LidarfwError
 from lidarfw.evaluation import evaluation_config
 from lidarfw.files import atomic_path, require_checkpoint, write_text
-from lidarfw.interfaces import Metric
-from lidarfw.interfaces.data import Dataset
+from lidarfw.interfaces import Dataset, Metric, Transform
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import box_corners, iou_3d
 from lidarfw.resampling import blocks, draws, interval
@@ -90,16 +88,15 @@ def detections(stages: Boxes, chosen: tuple[int, ...], regions: int | None = Non
     return kept
 
 
-def run(model: PerceptionModel, dataset: Dataset, transforms: Sequence[object]) -> Iterator[Seen]:
-    """The frames of a dataset, one by one."""
+def run(model: PerceptionModel, dataset: Dataset, transforms: Sequence[Transform]) -> Iterator[Seen]:
+    """The frames of a dataset that is ready, one by one."""
     head = next((module for module in model.modules() if isinstance(module, MSRMHead)), None)
     if head is None:
         raise ConfigError("the checkpoint has no head 'msrm'.\n  fix: one of experiment=msrm_town")
-    dataset.prepare()
     for number in track(range(len(dataset)), "frames", disable=not sys.stderr.isatty()):
         frame = dataset[number]
         for change in transforms:
-            frame = change(frame, np.random.default_rng(0))  # type: ignore[operator]
+            frame = change(frame, np.random.default_rng(0))
         with torch.no_grad():
             outputs = model(collate([frame]))
         output = next(value for value in outputs.values() if isinstance(value, MSRMOutput))
@@ -266,11 +263,11 @@ def _stages(model: PerceptionModel) -> int:
     return next((len(module.encoders) for module in model.modules() if isinstance(module, MSRMHead)), 0)
 
 
-def data_of(path: str, overrides: Sequence[str]) -> tuple[Dataset, Sequence[object]]:
-    """Test split and transforms of a checkpoint's config with overrides."""
+def data_of(path: str, overrides: Sequence[str]) -> tuple[Dataset, list[Transform]]:
+    """Test split and transforms of a checkpoint's config with overrides, ready to be read."""
     about = checkpoint.description(checkpoint.read(path), path)
-    config = to_plain(evaluation_config(checkpoint.config_of(about, path), overrides))
-    return make_dataset(config, config["splits"]["test"]), make_transforms(config, training=False)
+    config = evaluation_config(checkpoint.config_of(about, path), overrides)
+    return evaluation_data(config, config.splits.test)
 
 
 if __name__ == "__main__":
