@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from lidarfw import cli
 from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.transforms.ground_truth_sampling import GroundTruthSampling
+from lidarfw.components.transforms.object_database import ObjectDatabase
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset
 
@@ -67,6 +69,16 @@ def test_splits_share_a_folder_that_the_options_name(cls: type[TownDataset]) -> 
     assert make(workers=3).root in roots
     with pytest.raises(DataError, match="have the splits train, val"):
         make(split="everything")
+
+
+def test_objects_of_another_town_are_not_pasted(ready: Callable[..., Any], tmp_path: Path) -> None:
+    """A database of objects stands for one town: with another seed it is cut out anew."""
+    sampling = GroundTruthSampling(database=str(tmp_path))
+    found = []
+    for seed in (1, 2):
+        sampling.prepare(ready(TownKitti, seed=seed, frames=1, picture_width=0, camera_view=False))
+        found.append(ObjectDatabase.load(tmp_path).points)
+    assert found[0].tobytes() != found[1].tobytes()
 
 
 def test_traversals_are_of_one_circuit(ready: Callable[..., Any]) -> None:
