@@ -38,7 +38,12 @@ def read_points(path: str | Path, columns: int | None = None, repair: bool = Fal
     if reader is None:
         raise DataError(f"{path}: no scan format has the suffix {path.suffix!r}; there are {', '.join(SCAN_READERS)}")
     data = _read_bytes(path)
-    scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+    try:
+        scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+    except (ValueError, TypeError, OverflowError) as error:  # numpy refuses what the header says in many ways
+        raise DataError(
+            f"{path}: is not a readable {path.suffix} file: {error}.\n  fix: copy it again, or write it anew"
+        ) from error
     return _checked(path, scan, repair)
 
 
