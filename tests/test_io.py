@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -319,6 +321,20 @@ def test_pictures(tmp_path: Path) -> None:
                 read_image(tmp_path / name)
     cv2.imwrite(str(tmp_path / "grey.png"), picture[..., 0])
     assert read_image(tmp_path / "grey.png").shape == (20, 30, 3)
+
+
+def test_pictures_that_claim_too_many_pixels(tmp_path: Path) -> None:
+    png, tiff = (bytes(cv2.imencode(suffix, np.zeros((4, 4, 3), np.uint8))[1]) for suffix in (".png", ".tiff"))
+    head = b"IHDR" + struct.pack(">II", 100_000, 100_000) + png[24:29]
+    width = struct.pack("<HHI", 256, 4, 1)  # the tag, as uint32, of one value
+    files = {
+        "a.png": png[:12] + head + struct.pack(">I", zlib.crc32(head)) + png[33:],
+        "a.tiff": tiff.replace(struct.pack("<HHII", 256, 3, 1, 4), width + struct.pack("<I", 2**20 + 1)),
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=f"{name}: cannot be decoded .* too many pixels"):
+            read_image(tmp_path / name)
 
 
 def test_real_scans(real_data: Callable[[str], Path]) -> None:
