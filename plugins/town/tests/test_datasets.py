@@ -138,6 +138,13 @@ def test_more_drives_than_the_layout_has_are_refused(cache: str) -> None:
     assert TownNuScenes(drives=9, length=10, split="val").job.frames == 40
 
 
+def test_a_cache_that_cannot_be_made_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["prepare", "dataset=town_mos", "dataset.town_mos.cache=/dev/null/c", "--workers", "1"]) == 2
+    told = capsys.readouterr().err
+    assert "cannot write /dev/null/c" in told
+    assert "dataset.NAME.cache" in told
+
+
 def test_a_truth_that_is_gone_is_told(ready: Callable[..., Any]) -> None:
     dataset = ready(Town360)
     path = min(Path(dataset.root).glob("data_2d_depth/*_0000_sync/image_02/*.png"))

@@ -254,6 +254,14 @@ def test_the_command_reports_errors_plainly(tmp_path: Path, capsys: pytest.Captu
     assert "other settings" in capsys.readouterr().err
 
 
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["--out", str(tmp_path / "file" / "town")]) == 2
+    told = capsys.readouterr().err
+    assert f"cannot write {tmp_path / 'file' / 'town'}" in told
+    assert "fix: another folder" in told
+
+
 # what only one layout has
 
 
