@@ -38,7 +38,12 @@ def read_points(path: str | Path, columns: int | None = None, repair: bool = Fal
     if reader is None:
         raise DataError(f"{path}: no scan format has the suffix {path.suffix!r}; there are {', '.join(SCAN_READERS)}")
     data = _read_bytes(path)
-    scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+    try:
+        scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+    except (ValueError, TypeError, OverflowError) as error:  # numpy refuses what the header says in many ways
+        raise DataError(
+            f"{path}: is not a readable {path.suffix} file: {error}.\n  fix: copy it again, or write it anew"
+        ) from error
     return _checked(path, scan, repair)
 
 
@@ -53,7 +58,13 @@ def read_image(path: str | Path) -> np.ndarray:
     data = _read_bytes(path)
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < len(data) // 2:
         raise DataError(f"{path}: the JPEG is cut off, it has no end marker in its {len(data)} bytes; copy it again")
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise DataError(
+            f"{path}: cannot be decoded as a picture ({len(data)} bytes); does its header claim too many pixels?\n"
+            f"  OpenCV: {error.err}\n  fix: copy it again"
+        ) from error
     if picture is None:
         raise DataError(
             f"{path}: cannot be decoded as a picture ({len(data)} bytes); it is cut off or of no known format"
