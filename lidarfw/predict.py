@@ -17,7 +17,7 @@ from lidarfw import draw, kitti
 from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.components.datasets.drives import read_table
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.files import atomic_path, write_text
+from lidarfw.files import atomic_path, natural, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import transform
@@ -89,7 +89,7 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
     if not files:
         raise DataError(f"{path}: no file in this folder ends in {', '.join(suffixes)}")
-    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: natural(file.name))
 
 
 def _source(file: Path, calibration: Path | None, image: Path | None, lidar: bool) -> Source:
