@@ -290,7 +290,7 @@ def _check_targets(node: Any) -> None:
 
 def check_target(target: Any) -> None:
     """ConfigError unless `target` names a class that a config may build."""
-    prefixes = (*_ALLOWED_TARGETS, *_plugin_modules())
+    prefixes = (*_ALLOWED_TARGETS, *(f"{package}." for package in sorted(registry.packages() - {"lidarfw"})))
     refused = ConfigError(
         f"_target_ {str(target)[:80]!r} is not allowed in a config.\n  a config may build optimizers, schedulers, "
         f"trainers, loggers, callbacks, strategies and profilers from: {', '.join(prefixes)}\n"
@@ -309,11 +309,6 @@ def check_target(target: Any) -> None:
         raise refused
     if not f"{found.__module__}.".startswith(("torch.optim.", "lightning.", "lidarfw.", *prefixes)):
         raise refused  # an allowed module that re-exports a foreign class
-
-
-def _plugin_modules() -> list[str]:
-    modules = {e.value.partition(":")[0].partition(".")[0] for slot in SLOTS for e in registry.entries(slot)}
-    return sorted(f"{module}." for module in modules - {"lidarfw", "__main__"})
 
 
 def _allowed_bases() -> tuple[type, ...]:

@@ -33,18 +33,25 @@ def read_points(path: str | Path, columns: int | None = None, repair: bool = Fal
     `repair` drops points that are not finite, or farther than 100 km, which else are an error.
     Raises DataError for a file that is missing, unreadable, empty, cut off or of another format.
     """
-    path = Path(path)
+    return _checked(Path(path), _read(Path(path), columns), repair)
+
+
+def usable_points(path: str | Path, columns: int | None = None) -> np.ndarray:
+    """(N,) which points of a file `repair` keeps. DataError as `read_points`."""
+    return _usable(_read(Path(path), columns))
+
+
+def _read(path: Path, columns: int | None) -> Scan:
     reader = SCAN_READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError(f"{path}: no scan format has the suffix {path.suffix!r}; there are {', '.join(SCAN_READERS)}")
     data = _read_bytes(path)
     try:
-        scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+        return _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
     except (ValueError, TypeError, OverflowError) as error:  # numpy refuses what the header says in many ways
         raise DataError(
             f"{path}: is not a readable {path.suffix} file: {error}.\n  fix: copy it again, or write it anew"
         ) from error
-    return _checked(path, scan, repair)
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -90,20 +97,27 @@ def _checked(path: Path, scan: Scan, repair: bool) -> Scan:
     """The scan, or DataError if points are unusable and not to be repaired."""
     if not len(scan.xyz):
         raise DataError(f"{path}: the scan has no points")
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(scan.xyz) < FARTHEST).all(1)  # False for NaN
-    good = near & np.isfinite(scan.features).all(1)
+    good = _usable(scan)
     if not good.all():
         if not repair:
-            raise DataError(_describe_bad(path, scan, near))
+            raise DataError(_describe_bad(path, scan))
         scan = Scan(scan.xyz[good], scan.features[good], scan.names)
     if not scan.xyz.any():
         raise DataError(f"{path}: no point is usable: all {len(good)} are at the origin, not finite or beyond 100 km")
     return scan
 
 
-def _describe_bad(path: Path, scan: Scan, near: np.ndarray) -> str:
-    finite = np.isfinite(scan.xyz).all(1)
+def _near(scan: Scan) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        return (np.abs(scan.xyz) < FARTHEST).all(1)  # type: ignore[no-any-return]  # False for NaN
+
+
+def _usable(scan: Scan) -> np.ndarray:
+    return _near(scan) & np.isfinite(scan.features).all(1)
+
+
+def _describe_bad(path: Path, scan: Scan) -> str:
+    near, finite = _near(scan), np.isfinite(scan.xyz).all(1)
     counts = {
         "x, y, z not finite": (~finite).sum(),
         "x, y, z beyond 100 km": (finite & ~near).sum(),

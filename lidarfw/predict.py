@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from lidarfw.assembly import make_transforms
 from lidarfw.components.datasets.drives import read_table
 from lidarfw.data import evaluation_data
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.files import atomic_path, write_text
+from lidarfw.files import atomic_path, natural, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import transform
@@ -90,7 +91,7 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
     if not files:
         raise DataError(f"{path}: no file in this folder ends in {', '.join(suffixes)}")
-    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: natural(file.name))
 
 
 def _source(file: Path, calibration: Path | None, image: Path | None, lidar: bool) -> Source:
@@ -114,6 +115,10 @@ class FrameReader:
     ) -> None:
         """Options are those of `lidarfw.io.read_points`; intensities are divided by `intensity_max`."""
         self.data = model.plan.data
+        if not 0 < intensity_max < math.inf:
+            raise ConfigError(f"the full scale of intensity must be above 0, got {intensity_max:g}")
+        if columns is not None and columns < 3:
+            raise ConfigError(f"a scan has at least 3 columns (x, y, z), got {columns}")
         self.columns, self.repair, self.intensity_max = columns, repair, intensity_max
         self.transforms = make_transforms(model.plan.config, training=False)
         self.needed = needed_inputs(model)
@@ -180,7 +185,7 @@ def needed_inputs(model: PerceptionModel) -> set[str]:
 
 def _check_intensity(path: Path, values: torch.Tensor) -> None:
     low, high = float(values.min()), float(values.max())
-    if low < 0 or high > 1:
+    if not (low >= 0 and high <= 1):  # of NaN neither is true
         guess = 255 if high <= 255 else 65535
         raise DataError(
             f"{path}: intensity is {low:g}..{high:g}, models learn from 0..1.\n"

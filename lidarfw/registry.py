@@ -6,6 +6,7 @@ import difflib
 import functools
 import importlib
 import importlib.metadata
+import inspect
 import json
 import sys
 import traceback
@@ -89,6 +90,18 @@ def use(**slots: dict[str, Any]) -> Iterator[None]:
         _in_use.remove(slots)
 
 
+def packages() -> set[str]:
+    """Top-level packages of all declared components."""
+    return {entry.value.partition(":")[0].partition(".")[0] for slot in SLOTS for entry in entries(slot)} - {"__main__"}
+
+
+def trusted(name: str) -> bool:
+    """Whether a stranger may choose this component: it is named, or its class is of a package that declares some."""
+    module, colon, _ = name.partition(":")
+    parts = module.split(".")
+    return not colon or (parts[0] in packages() and "__main__" not in parts)
+
+
 def find(slot: str, name: str) -> Entry:
     """The entry of a component: a registered name, or "package.module:Class" for a class that is not packaged."""
     if ":" in name:
@@ -118,13 +131,16 @@ def load(slot: str, name: str) -> Any:
     entry = find(slot, name)
     module, _, attribute = entry.value.partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = getattr(importlib.import_module(module), attribute)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a broken plugin may even call sys.exit while it is imported
         origin = f" ({entry.origin})" if entry.origin else ""
         reason = f"{error or type(error).__name__}, at {_where(error)}"
         raise RegistryError(f"component could not be imported: {slot} {name!r}{origin}: {reason}") from error
+    if not inspect.isclass(found):
+        raise RegistryError(f"{slot} {name!r} is no class: {entry.value} is a {type(found).__name__}")
+    return found
 
 
 def _where(error: BaseException) -> str:

@@ -274,7 +274,10 @@ def check_resumable(content: Mapping[str, Any], module: PerceptionModule) -> Non
     there, here = (spec["data_spec"]["classes"] for spec in (about, module.about))
     if there == here and not (report.missing or report.skipped or report.mismatched):
         return
-    stored, own = (checkpoint.config_of(spec, "the checkpoint to resume from") for spec in (about, module.about))
+    stored, own = (
+        checkpoint.config_of(spec, "the checkpoint to resume from", allow_unregistered=True)  # only to be compared
+        for spec in (about, module.about)
+    )
     changes = [line for line in differences(stored, own) if line.startswith((*MODEL_KEYS, "dataset"))]
     raise CheckpointError(
         "cannot resume: the checkpoint is of another model.\n"
@@ -462,20 +465,27 @@ def _logger(node: dict[str, Any], folder: Path) -> Any:
 # --- evaluation -----------------------------------------------------------------------------------------------------
 
 
-def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecord | None = None) -> dict[str, float]:
+def evaluate(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    record: FrameRecord | None = None,
+    *,
+    allow_unregistered: bool = False,
+) -> dict[str, float]:
     """Figures ("metric/key") of a checkpoint on the test split of its config.
 
     The model comes from the checkpoint; dataset, transforms, metric, loader, splits and trainer from its config too,
     changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`). `record`
-    is filled with what every frame adds to the metrics; it needs an evaluation in one process. Raises ConfigError for
-    an override of what was learned, CheckpointError where the data is not what the model learned.
+    is filled with what every frame adds to the metrics; it needs an evaluation in one process. `allow_unregistered` is
+    that of `lidarfw.load`. Raises ConfigError for an override of what was learned, CheckpointError where the data is
+    not what the model learned.
     """
     from lidarfw.assembly import build, plan
 
     _quieten()
     content = checkpoint.read(path)
     about = checkpoint.description(content, path)
-    config = evaluation_config(checkpoint.config_of(about, path), overrides)
+    config = evaluation_config(checkpoint.config_of(about, path, allow_unregistered=allow_unregistered), overrides)
     wired = plan(config)
     _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
     pl.seed_everything(config.seed, verbose=False)

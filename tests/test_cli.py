@@ -2,7 +2,7 @@
 
 import pytest
 
-from lidarfw.cli import parse
+from lidarfw.cli import main, parse
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,12 @@ def test_what_a_command_does_not_know_is_an_error(words, capsys):
         parse(words.split())
     assert stop.value.code == 2
     assert "unrecognized arguments: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["show", "head={center:{type:'os:system'}}"], "head 'os:system' is no class: os:system is a builtin_function")],
+)  # fmt: skip
+def test_a_mistake_gives_a_message(words, message, capsys):
+    assert main(words) == 2
+    assert message in capsys.readouterr().err

@@ -35,6 +35,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _hydra(arguments: list[str]) -> int:
     import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
     from omegaconf import DictConfig
 
     argv = sys.argv
@@ -47,8 +49,11 @@ def _hydra(arguments: list[str]) -> int:
 
         try:
             return train(cfg)
-        except LidarfwError as error:  # Hydra would print a trace; the other jobs of a sweep go on
-            failed.append(error)
+        except LidarfwError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:  # perhaps in another process: only Hydra brings it home
+                print(f"{HydraConfig.get().runtime.output_dir}: {error}", file=sys.stderr)
+                raise
+            failed.append(error)  # Hydra would print a trace
             return None
 
     sys.argv = [argv[0], *arguments]

@@ -209,6 +209,33 @@ def test_seeds_of_a_run_are_a_sweep_of_a_launcher(file, tmp_path, start):
     assert work.result(stated.claims[0].variant, 2)["figures"]["toy/frames"] == 24
 
 
+def test_a_sweep_that_fails_is_not_taken_for_an_older_checkpoint(file, tmp_path, start):
+    stated = reading.read(file, ["dataset.toy.poison=3"])
+    work = running.Work(stated, [replace(stated.claims[0], baseline=0.5)], tmp_path / "runs")
+    for job in work.left:
+        (job.folder / "checkpoints").mkdir(parents=True)
+    runner = running.Runner(work, launcher="basic")
+    runner.run()
+    assert set(runner.failed) == set(work.jobs)
+    assert not any(job.trained for job in work.left)
+    log = (job.folder.parent / "log.txt").read_text()
+    assert all(f"{job.folder}: " in log for job in work.left)  # both are named
+    assert start.of("eval") == 0
+
+
+def test_a_training_without_a_checkpoint_fails_alone(file, tmp_path, start):
+    text = file.read_text().replace("untrained: [optimizer.lr=1e-7]", "untrained: [trainer.fast_dev_run=true]")
+    file.write_text(text.replace("seeds: [1, 2]", "seeds: [1]"))
+    stated = reading.read(file)
+    for launcher in (None, "basic"):
+        work = running.Work(stated, stated.claims[:1], tmp_path / f"runs_{launcher}")
+        runner = running.Runner(work, jobs=1, launcher=launcher)
+        runner.run()
+        ((folder, reason),) = runner.failed.items()
+        assert "left no checkpoints/last.ckpt" in reason
+        assert [job.folder for job in work.left] == [folder]
+
+
 def test_a_budget_starts_nothing_that_cannot_end_in_time(file, tmp_path, start):
     stated = reading.read(file)
     work = running.Work(stated, [replace(stated.claims[0], baseline=0.5, seeds=(1,))], tmp_path / "runs")

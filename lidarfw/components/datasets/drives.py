@@ -146,9 +146,9 @@ def _moved(scan: Points, drive: Drive, past: int, now: int) -> Points:
     return scan.replace(xyz=xyz.float(), time=time)
 
 
-def read_scan(path: Path) -> Points:
-    """A scan of float32 x, y, z, remission; DataError where remission is not 0..1."""
-    scan = read_points(path, columns=4)
+def read_scan(path: Path, repair: bool = False) -> Points:
+    """A scan of float32 x, y, z, remission; DataError where remission is not 0..1. `repair` as in `read_points`."""
+    scan = read_points(path, columns=4, repair=repair)
     low, high = float(scan.features.min()), float(scan.features.max())
     if low < 0 or high > 1:
         raise DataError(f"{path}: remission: expected 0..1, found {low:g}..{high:g}. Is it a scan of 4 columns?")

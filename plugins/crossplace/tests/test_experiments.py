@@ -109,6 +109,8 @@ def test_pairs_are_of_both_sensors_in_half_of_the_cases() -> None:
     assert (first != second).mean() == pytest.approx(0.5, abs=0.06)
     with pytest.raises(ConfigError, match="do not fit 'synthetic'"):
         EitherSensor(of="synthetic", options={"colour": 1})
+    with pytest.raises(ConfigError, match="name of an installed dataset"):
+        EitherSensor(of="this:Data")
 
 
 def test_one_network_reads_one_map_or_all_of_them(capsys: pytest.CaptureFixture[str]) -> None:
