@@ -113,7 +113,8 @@ def _near(scan: Scan) -> np.ndarray:
 
 
 def _usable(scan: Scan) -> np.ndarray:
-    return _near(scan) & np.isfinite(scan.features).all(1)
+    good: np.ndarray = _near(scan) & np.isfinite(scan.features).all(1)
+    return good
 
 
 def _describe_bad(path: Path, scan: Scan) -> str:

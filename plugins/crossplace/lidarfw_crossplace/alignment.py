@@ -44,20 +44,26 @@ class Alignment:
     hull: tuple[tuple[float, float], ...] = ()  # corners of the convex hull of the matches, in order
 
     def moved(self, place: Tensor) -> Tensor:
-        """Places (N, 2) where the camera shows them; the correction fades outside the matches."""
+        """Places (N, 2) where the camera shows them; outside the matches the correction of the nearest place fades."""
         if not self.coefficients:
             return place
-        terms = torch.from_numpy(polynomial_terms(place.double().numpy(), DEGREE))
-        target = terms @ torch.tensor(self.coefficients, dtype=torch.double)
-        share = (1 - self._outside(place.double()) / _FADE).clamp(0, 1)[:, None]
-        return (place + share * (target - place)).to(place)
+        nearest = self._nearest(place.double())
+        terms = torch.from_numpy(polynomial_terms(nearest.numpy(), DEGREE))
+        correction = terms @ torch.tensor(self.coefficients, dtype=torch.double) - nearest
+        share = (1 - (nearest - place).norm(dim=1, keepdim=True) / _FADE).clamp(min=0)
+        moved: Tensor = (place + share * correction).to(place)
+        return moved
 
-    def _outside(self, place: Tensor) -> Tensor:
-        """(N,) how far places lie outside the hull; 0 within."""
-        corners = torch.tensor(self.hull, dtype=place.dtype)
-        along = torch.nn.functional.normalize(corners.roll(-1, 0) - corners, dim=1)
-        normal = torch.stack([along[:, 1], -along[:, 0]], 1)  # outwards, of corners that run against the clock
-        return ((place[:, None] - corners) * normal).sum(2).amax(1).clamp(min=0)
+    def _nearest(self, place: Tensor) -> Tensor:
+        """The nearest places (N, 2) of the hull; places within stay."""
+        start = torch.tensor(self.hull, dtype=place.dtype)
+        edge = start.roll(-1, 0) - start
+        off = place[:, None] - start  # (N, corners, 2)
+        outside = (off[..., 0] * edge[:, 1] - off[..., 1] * edge[:, 0]).amax(1) > 0  # corners run against the clock
+        share = ((off * edge).sum(2) / edge.square().sum(1)).clamp(0, 1)
+        on_edge = start + share[..., None] * edge
+        best = (on_edge - place[:, None]).norm(dim=2).argmin(1)
+        return torch.where(outside[:, None], on_edge[torch.arange(len(place)), best], place)
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file."""

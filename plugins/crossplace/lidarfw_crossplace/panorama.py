@@ -97,16 +97,17 @@ class Stitcher:
 
     def blend(self, pictures: Sequence[Tensor]) -> Tensor:
         """One panorama (C, H, W) of a picture (C, h, w) from each camera; 0 where none sees."""
-        seen = self._sampled(pictures, "bilinear")
+        seen = self.alone(pictures)
         return torch.stack([part * weight for part, weight in zip(seen, self.weight, strict=True)]).sum(0)
 
     def pick(self, pictures: Sequence[Tensor]) -> Tensor:
         """The same for labels and distances, which must not be mixed: a pixel of the camera that counts most."""
-        seen = torch.stack(self._sampled(pictures, "nearest"))
+        seen = torch.stack(self.alone(pictures, "nearest"))
         best = self.weight.argmax(0).expand(1, *seen.shape[1:])
         return torch.where(self.covered, seen.gather(0, best)[0], 0)
 
-    def _sampled(self, pictures: Sequence[Tensor], mode: str) -> list[Tensor]:
+    def alone(self, pictures: Sequence[Tensor], mode: str = "bilinear") -> list[Tensor]:
+        """What each camera gives by itself, (C, H, W); where it does not see, anything."""
         return [
             F.grid_sample(picture[None], place[None], mode, "border", align_corners=True)[0]
             for picture, place in zip(pictures, self.place, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,21 +13,25 @@ import numpy as np
 from lidarfw._lazy import LazyModule
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset, Transform
-from lidarfw.types import BEV, DataSpec, Frame, Image, Points, RangeView, Spec
+from lidarfw.types import BEV, Camera, DataSpec, Frame, Image, Points, RangeView, Spec
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+    from lidarfw_crossplace import alignment as aligning
     from lidarfw_crossplace import labels, networks, panorama
 else:
     torch = LazyModule("torch")
+    aligning = LazyModule("lidarfw_crossplace.alignment")
     networks = LazyModule("lidarfw_crossplace.networks")
     labels = LazyModule("lidarfw_crossplace.labels")
     panorama = LazyModule("lidarfw_crossplace.panorama")
 
 CHANNELS = {"intensity": 1, "depth": 1, "semantics": 3}
 FILLS = ("inpaint", "zero")
+log = logging.getLogger(__name__)
+_ALIGN_FRAMES = 50
 _EGO_FRAMES = 200
 _EGO_MOVES = 0.02  # standard deviation of the grey value below which a pixel shows the own vehicle
 
@@ -62,6 +67,7 @@ class Panorama(Transform):
         cameras: tuple[str, ...] = ("image_02", "image_03"),
         fov: float = 3.2288591161895095,
         power: float = 5.0,
+        alignment: str = "",
         ego_mask: str = "",
         ego_fill: str = "inpaint",
         depth_network: str = "",
@@ -75,11 +81,13 @@ class Panorama(Transform):
         maps: which of intensity, depth, semantics. stack: give them as one input `panorama`, for early fusion. height,
         width, up, down: pixels, and elevations of the upper and lower edge in radians. nearest, farthest: metres, of
         points. gap: rows of a column that are filled between two points, negative for any. cameras: inputs to stitch.
-        fov: of a camera, radians. power: of the depth of pictures. ego_mask: picture, white where the own vehicle is;
-        made from the frames if it is not there; empty for none. ego_fill: inpaint or zero, for intensity and depth of
-        cameras; the classes there are road. depth_network, semantics_network: of the library transformers, by name or
-        folder. inpaint_network: TorchScript file of LaMa, instead of the classical inpainting. cache: folder for what
-        these say. sphere: columns of the panorama that they look at.
+        fov: of a camera, radians. alignment: file that says where the second of two cameras shows what the first does,
+        by what both see (paper 3.1); made from the frames if it is not there; empty: by calibration alone. power: of
+        the depth of pictures. ego_mask: picture, white where the own vehicle is; made from the frames if it is not
+        there; empty for none. ego_fill: inpaint or zero, for intensity and depth of cameras; the classes there are
+        road. depth_network, semantics_network: of the library transformers, by name or folder. inpaint_network:
+        TorchScript file of LaMa, instead of the classical inpainting. cache: folder for what these say. sphere: columns
+        of the panorama that they look at.
         """
         unknown = [name for name in maps if name not in CHANNELS]
         if unknown or not maps or ego_fill not in FILLS:
@@ -90,7 +98,11 @@ class Panorama(Transform):
         self.maps, self.stack, self.cameras = tuple(maps), stack, tuple(cameras)
         self.view = RangeView(height, width, up, down)
         self.nearest, self.farthest, self.gap, self.fov, self.power = nearest, farthest, gap, fov, power
-        self.ego_mask, self.ego_fill = ego_mask, ego_fill
+        if alignment and len(self.cameras) != 2:
+            raise ConfigError(
+                f"transform 'panorama': alignment is of two cameras, there are {len(self.cameras)}\n  fix: alignment=''"
+            )
+        self.alignment, self.ego_mask, self.ego_fill = alignment, ego_mask, ego_fill
         self.networks = {"depth": depth_network, "semantics": semantics_network, "inpaint": inpaint_network}
         self.cache, self.sphere = cache, sphere
         if any(self.networks.values()) and not cache:
@@ -123,16 +135,31 @@ class Panorama(Transform):
         self.classes = tuple(dataset.spec.classes)
 
     def prepare(self, dataset: Dataset, workers: int = 1) -> None:
-        """Make the mask of the own vehicle from frames of the dataset, unless it stands, and ask the networks."""
+        """Make alignment and mask of the own vehicle from frames of the dataset, unless they stand; ask networks."""
+        if self.alignment and not Path(self.alignment).is_file():
+            self._align(dataset)
         if self.ego_mask and not Path(self.ego_mask).is_file():
             from lidarfw.draw import write_png
 
-            steps = np.linspace(0, len(dataset) - 1, min(len(dataset), _EGO_FRAMES)).round().astype(int)
-            greys = torch.stack([self._seen(dataset[int(number)]) for number in np.unique(steps)])
+            greys = torch.stack([self._seen(dataset[number]) for number in _spread(len(dataset), _EGO_FRAMES)])
             still = (greys.std(0, correction=0) < _EGO_MOVES) & (greys.mean(0) > 0)
             write_png(self.ego_mask, np.repeat((still[0].numpy() * np.uint8(255))[..., None], 3, 2))
         if self._asked:
             self._ask_all(dataset, workers)
+
+    def _align(self, dataset: Dataset) -> None:
+        """Fit where the second camera shows what the first does, by frames of the dataset."""
+        view, found = RangeView(1024, 4096, math.pi / 4, -math.pi / 4), []
+        for number in _spread(len(dataset), _ALIGN_FRAMES):
+            rig, pictures = self._rig(dataset[number])
+            stitcher = panorama.stitcher(view, rig, self.fov)
+            one, other = (panorama.grey(part)[0] for part in stitcher.alone(pictures))
+            found.append(aligning.matches(one, other, (stitcher.weight > 0).all(0), view, aligning.azimuth_of(rig[1])))
+        try:
+            aligning.pooled(found).save(self.alignment)
+        except DataError as error:
+            log.warning("%s\n  the cameras are stitched by their calibration alone", error)
+            aligning.Alignment().save(self.alignment)
 
     def _ask_all(self, dataset: Dataset, workers: int) -> None:
         """Ask the networks about every frame that is not in the cache, `workers` frames at a time."""
@@ -231,7 +258,8 @@ class Panorama(Transform):
         mask = hashlib.blake2b(self._ego.numpy().tobytes(), digest_size=8).hexdigest()
         return (
             f"{', '.join(self._asked)} by {self.networks} in {self.view} of {self.sphere} columns, cameras "
-            f"{', '.join(self.cameras)} of {self.fov} radians, own vehicle {mask} filled by {self.ego_fill}"
+            f"{', '.join(self.cameras)} of {self.fov} radians, {self._aligned}, own vehicle {mask} "
+            f"filled by {self.ego_fill}"
         )
 
     def _ask(self, frame: Frame) -> networks.Said:
@@ -251,12 +279,12 @@ class Panorama(Transform):
         return said
 
     @functools.cached_property
-    def _depth_network(self) -> networks.DepthNetwork | None:
-        return networks.DepthNetwork(self.networks["depth"]) if self.networks["depth"] else None
+    def _depth_network(self) -> networks.DepthNetwork:
+        return networks.DepthNetwork(self.networks["depth"])
 
     @functools.cached_property
-    def _semantics_network(self) -> networks.SemanticNetwork | None:
-        return networks.SemanticNetwork(self.networks["semantics"]) if self.networks["semantics"] else None
+    def _semantics_network(self) -> networks.SemanticNetwork:
+        return networks.SemanticNetwork(self.networks["semantics"])
 
     @functools.cached_property
     def _inpaint_network(self) -> networks.InpaintingNetwork | None:
@@ -265,12 +293,22 @@ class Panorama(Transform):
     def _pictures(
         self, frame: Frame, kind: str = "", view: RangeView | None = None
     ) -> tuple[panorama.Stitcher, list[Tensor]]:
+        rig, pictures = self._rig(frame, kind)
+        return panorama.stitcher(view or self.view, rig, self.fov, alignment=self._aligned), pictures
+
+    def _rig(self, frame: Frame, kind: str = "") -> tuple[tuple[Camera, ...], list[Tensor]]:
+        """The cameras and their pictures (C, h, w)."""
         missing = [name for name in self.cameras if f"{name}{kind}" not in frame.inputs]
         if missing:
             raise DataError(f"frame {frame.meta.id} has no input {missing[0]}{kind}; it has {', '.join(frame.inputs)}")
         images = [frame.inputs[f"{name}{kind}"] for name in self.cameras]
-        rig = tuple(image.cameras[0] for image in images)
-        return panorama.stitcher(view or self.view, rig, self.fov), [image.features[0] for image in images]
+        return tuple(image.cameras[0] for image in images), [image.features[0] for image in images]
+
+    @property
+    def _aligned(self) -> aligning.Alignment:
+        if self.alignment and not Path(self.alignment).is_file():
+            raise DataError(f"{self.alignment}: no such file\n  fix: lidarfw prepare with this experiment makes it")
+        return aligning.Alignment.load(self.alignment) if self.alignment else aligning.Alignment()
 
     def _seen(self, frame: Frame) -> Tensor:
         """(1, H, W) grey values, own vehicle and all."""
@@ -327,6 +365,11 @@ class Panorama(Transform):
         if not self.ego_mask:
             return torch.zeros(self.view.height, self.view.width, dtype=torch.bool)
         return self._own_vehicle
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many numbers of frames, evenly spread."""
+    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
 
 
 class RandomHeading(Transform):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lidarfw.errors import DataError
-from lidarfw.types import Camera
+from lidarfw.errors import ConfigError, DataError
+from lidarfw.types import Camera, Frame, FrameMeta, Image, Targets
 from torch import Tensor
 
 from lidarfw_crossplace import panorama
@@ -24,6 +25,7 @@ from lidarfw_crossplace.alignment import (
     pooled,
     rays_of,
 )
+from lidarfw_crossplace.transforms import Panorama
 
 FOV = math.radians(200)
 VIEW = panorama.sphere(1024)
@@ -67,14 +69,23 @@ def painted(seed: int) -> Tensor:
 def apart(cameras: tuple[Camera, Camera], pictures: list[Tensor], alignment: Alignment) -> float:
     """Mean difference of what the cameras show where both see."""
     stitcher = panorama.stitcher(VIEW, cameras, FOV, alignment=alignment)
-    seen = [part[0] for part in stitcher._sampled(pictures, "bilinear")]
+    seen = [part[0] for part in stitcher.alone(pictures)]
     both = (stitcher.weight > 0).all(0)
     return float((seen[0] - seen[1])[both].abs().mean())
 
 
+def frame(pictures: list[Tensor], cameras: tuple[Camera, Camera]) -> Frame:
+    """Colour pictures of KITTI-360's fisheyes."""
+    images = {
+        f"image_0{number + 2}": Image(grey.expand(1, 3, -1, -1), (camera,))
+        for number, (grey, camera) in enumerate(zip(pictures, cameras, strict=True))
+    }
+    return Frame(dict(images), Targets(), FrameMeta("f", modality="camera"))
+
+
 def found_in(cameras: tuple[Camera, Camera], pictures: list[Tensor]) -> tuple[np.ndarray, np.ndarray]:
     stitcher = panorama.stitcher(VIEW, cameras, FOV)
-    one, other = (part[0] for part in stitcher._sampled(pictures, "bilinear"))
+    one, other = (part[0] for part in stitcher.alone(pictures))
     return matches(one, other, (stitcher.weight > 0).all(0), VIEW, azimuth_of(cameras[1]))
 
 
@@ -129,6 +140,41 @@ def test_pictures_without_a_corner_have_no_matches() -> None:
     flat = torch.full((512, 1024), 0.5)
     place, target = matches(flat, flat, torch.ones(512, 1024, dtype=torch.bool), VIEW, 0.0)
     assert place.shape == target.shape == (0, 2)
+
+
+def test_panoramas_are_aligned_by_frames_of_the_dataset(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    said, true = rig(), rig(math.radians(2))
+    frames = [frame([picture(camera, painted(seed)) for camera in true], said) for seed in (0, 1, 7)]
+    options: dict[str, Any] = {"maps": ("intensity",), "fov": FOV, "alignment": str(tmp_path / "rig.json")}
+    made = Panorama(**options)
+    with pytest.raises(DataError, match=r"rig.json: no such file(.|\n)*lidarfw prepare"):
+        made(frames[2], np.random.default_rng(0))
+    made.prepare(frames[:2])  # type: ignore[arg-type]
+    assert "calibration" not in caplog.text
+    intensity, plain, right = (
+        transform(one, np.random.default_rng(0)).inputs["intensity"].features[0, 0]
+        for transform, one in (
+            (made, frames[2]),
+            (Panorama(maps=("intensity",), fov=FOV), frames[2]),
+            (Panorama(maps=("intensity",), fov=FOV), frame([picture(c, painted(7)) for c in true], true)),
+        )
+    )
+    both = slice(500, 524)  # columns ahead, which both see
+    assert (intensity - right)[:, both].abs().mean() < 0.5 * (plain - right)[:, both].abs().mean()
+
+
+def test_frames_without_matches_leave_the_calibration_and_say_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    flat = frame([torch.full((1, 900, 900), 0.5)] * 2, rig())
+    options: dict[str, Any] = {"maps": ("intensity",), "fov": FOV}
+    made = Panorama(**options, alignment=str(tmp_path / "rig.json"))
+    made.prepare([flat])  # type: ignore[arg-type]
+    assert "0 of 0 matches of both cameras agree, needed are 18" in caplog.text
+    assert "by their calibration alone" in caplog.text
+    made(flat, np.random.default_rng(0))
+    with pytest.raises(ConfigError, match="two cameras"):
+        Panorama(**options, cameras=("image",), alignment="rig.json")
 
 
 def test_the_file(tmp_path: Path) -> None:
