@@ -22,8 +22,8 @@ GLOBAL_KEYS = ("experiment", "debug")  # options of these set other keys
 def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
     """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set.
 
-    What comes after the heads may change too (`filter=NAME`, `postprocessor.nms.iou_threshold=0.5`), as far as the weights
-    of the checkpoint still fit.
+    What comes after the heads may change too (`filter=NAME`, `postprocessor.nms.iou_threshold=0.5`), as far as the
+    weights of the checkpoint still fit.
     """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
