@@ -22,7 +22,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -204,7 +204,8 @@ def _values(override: Override) -> list[str]:
     """The overrides that stand for one, several for a sweep; none where only the sweeper knows them."""
     if not override.is_sweep_override():
         return [override.input_line or ""]
-    values = override.sweep_string_iterator() if override.is_discrete_sweep() else ()
+    listed = override.is_discrete_sweep() and not isinstance(override.value(), Glob)
+    values = override.sweep_string_iterator() if listed else ()
     return [f"{override.get_key_element()}={value}" for value in values]
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from lidarfw import registry
 from lidarfw.cli import main, parse
+from lidarfw.config import jobs_to_compose
 
 
 @pytest.mark.parametrize(
@@ -45,6 +46,13 @@ def test_a_mistake_gives_a_message(words, message, capsys, tmp_path, monkeypatch
     assert main(words) == 2
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["FILE"]
+
+
+def test_what_of_a_sweep_is_composed_first():
+    """Every choice of a group once; what only the sweeper can list, not at all."""
+    words = ["-m", "head=anchor,center", "seed=1,2", "neck=glob(b*)", "optimizer.lr=interval(0.1,1)", "name='a,b'"]
+    rest = ["seed=1", "name='a,b'"]
+    assert list(jobs_to_compose(words)) == [["head=anchor", *rest], ["head=center", *rest]]
 
 
 def test_a_broken_pyproject_is_pointed_out_and_the_others_work(capsys, tmp_path, monkeypatch, caplog):
