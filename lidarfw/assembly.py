@@ -503,7 +503,7 @@ def _build_step(step: Step, specs: dict[tuple[str, Any, str], Any], data: DataSp
     cls = registry.load(step.slot, step.declared.entry.name)
     try:
         return cls(**arguments, **step.options)
-    except (ValueError, LidarfwError) as error:
+    except (ValueError, RuntimeError, LidarfwError) as error:  # RuntimeError: torch's, of a size that cannot be
         kind = type(error) if isinstance(error, LidarfwError) else AssemblyError
         raise kind(f"{step.id}: {error}") from error
 

@@ -15,8 +15,9 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers.logger import Logger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
 
+from lidarfw.errors import ConfigError
 from lidarfw.files import atomic_path
 from lidarfw.types import collate
 
@@ -35,7 +36,9 @@ class Checkpoints(Checkpoint):
     def __init__(self, *, every_n_steps: int = 500, monitor: str | None = None, mode: str = "max") -> None:
         self.every_n_steps = every_n_steps
         self.monitor = monitor  # default: what the model names, see PerceptionModel.monitor
-        self.sign = {"max": 1.0, "min": -1.0}[mode]
+        if mode not in ("max", "min"):
+            raise ConfigError(f"callbacks.checkpoints.mode is {mode!r}; use max or min")
+        self.sign = 1.0 if mode == "max" else -1.0
         self.best: float | None = None
         self.saved_at = 0  # global step of last.ckpt
         self.folder = Path("checkpoints")
@@ -68,6 +71,9 @@ class Checkpoints(Checkpoint):
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the best."""
         figure = trainer.callback_metrics.get(self.monitor or "")
+        if self.monitor and figure is None and not trainer.sanity_checking:
+            names = ", ".join(name for name in trainer.callback_metrics if name.startswith("val/")) or "none"
+            rank_zero_warn(f"no best.ckpt: there is no figure {self.monitor!r} to monitor.\n  there are: {names}")
         if not _in_training(trainer) or figure is None or torch.isnan(figure):
             return
         value = float(figure)

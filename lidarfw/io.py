@@ -109,12 +109,13 @@ def _checked(path: Path, scan: Scan, repair: bool) -> Scan:
 
 def _near(scan: Scan) -> np.ndarray:
     with np.errstate(invalid="ignore"):
-        return (np.abs(scan.xyz) < FARTHEST).all(1)  # type: ignore[no-any-return]  # False for NaN
+        near: np.ndarray = (np.abs(scan.xyz) < FARTHEST).all(1)  # False for NaN
+    return near
 
 
 def _usable(scan: Scan) -> np.ndarray:
-    good: np.ndarray = _near(scan) & np.isfinite(scan.features).all(1)
-    return good
+    usable: np.ndarray = _near(scan) & np.isfinite(scan.features).all(1)
+    return usable
 
 
 def _describe_bad(path: Path, scan: Scan) -> str:

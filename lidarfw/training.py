@@ -344,7 +344,7 @@ def train(config: DictConfig) -> dict[str, float]:
         wired = plan(config)
         for warning in wired.warnings:
             rank_zero_warn(warning)
-        pl.seed_everything(config.seed, verbose=False)
+        _seed_everything(config.seed)
         model = build(wired)
         _initialise(model, config.init)
         module = _module(model, to_plain(config), checkpoint.describe(wired))
@@ -360,6 +360,12 @@ def _quieten() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     for text in (".*LeafSpec.*", ".*does not have many workers.*", ".*smaller than the logging interval.*"):
         warnings.filterwarnings("ignore", message=text)
+
+
+def _seed_everything(seed: Any) -> None:
+    if not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ConfigError(f"seed must be a whole number from 0 to 2**32 - 1, found {seed!r}")
+    pl.seed_everything(seed, verbose=False)
 
 
 def _module(model: PerceptionModel, config: Mapping[str, Any], about: Mapping[str, Any]) -> PerceptionModule:
@@ -488,7 +494,7 @@ def evaluate(
     config = evaluation_config(checkpoint.config_of(about, path, allow_unregistered=allow_unregistered), overrides)
     wired = plan(config)
     _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
-    pl.seed_everything(config.seed, verbose=False)
+    _seed_everything(config.seed)
     model = build(wired)
     checkpoint.restore(model, content, path)
     module = _module(model, to_plain(config), about)

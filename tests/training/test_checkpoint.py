@@ -390,7 +390,8 @@ def test_evaluate_does_not_depend_on_the_batch_size(trained):
     [("head.toy.depth=3", "head is part of the model"), ("backbone=toy", "backbone is part of the model"),
      ("optimizer.lr=1", "an evaluation does not train"), ("dataset.toy.frmes=3", "has no 'dataset.toy.frmes'"),
      ("dataset.kitti.root=x", "has no 'dataset.kitti.root'"), ("loader", "cannot read the overrides"),
-     ("splits.test=null", "there is no test data")],
+     ("splits.test=null", "there is no test data"), ("seed=abc", "seed must be a whole number"),
+     ("experiment=pillars_kitti", "experiment would set parts of the model"), ("~metric", "~metric has no effect")],
 )  # fmt: skip
 def test_evaluate_refuses(override, text, trained):
     with pytest.raises(ConfigError, match=text):

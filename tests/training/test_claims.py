@@ -14,10 +14,13 @@ import pytest
 import training_parts
 from training_runs import assert_same_weights
 
+from lidarfw.assembly import plan
 from lidarfw.claims import judging, reading, reporting, running
 from lidarfw.claims.reading import Claim, Run
 from lidarfw.cli import main
+from lidarfw.config import compose
 from lidarfw.errors import ConfigError, DataError
+from lidarfw.evaluation import evaluation_config
 from lidarfw.resampling import draws
 
 TRAINED = Run("trained", ())
@@ -55,6 +58,15 @@ claims:
     better: higher
     long: true
 """
+
+
+def test_the_file_of_the_documentation_is_accepted(tmp_path):
+    pytest.importorskip("lidarfw_town")
+    text = (Path(__file__).parents[2] / "docs/claims.md").read_text().partition("```yaml\n")[2].partition("```")[0]
+    (tmp_path / "claims.yaml").write_text(text)
+    stated = reading.read(tmp_path / "claims.yaml")
+    for run in {run.name: run for claim in stated.claims for run in claim.runs}.values():
+        assert evaluation_config(plan(compose(list(run.overrides))).config, run.evaluation)
 
 
 class Forked:

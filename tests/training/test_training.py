@@ -75,6 +75,12 @@ def test_a_figure_that_should_be_small(run, tmp_path):
     assert best["global_step"] == min(at_validation, key=at_validation.get) + 1
 
 
+def test_a_figure_that_is_not_there_is_said(run, tmp_path):
+    with pytest.warns(UserWarning, match=r"no best.ckpt: there is no figure 'val/nope' .*\n.*val/toy/accuracy"):
+        run(tmp_path, "trainer.max_epochs=1", "callbacks.checkpoints.monitor=val/nope")
+    assert not (tmp_path / "checkpoints/best.ckpt").exists()
+
+
 def test_filters_that_hold_frames_back_lose_none(run, tmp_path):
     plain = run(tmp_path / "plain", "trainer.max_epochs=1")
     delayed = run(tmp_path / "delayed", "trainer.max_epochs=1", "filter=delay", "loader.batch_size=5")
@@ -257,7 +263,8 @@ def test_overfitting_repeats_the_same_batches(run, tmp_path, monkeypatch):
      ("optimizer.lr=-1", "optimizer: AdamW: Invalid learning rate"),
      ("+scheduler.foo=1", "scheduler: OneCycleLR: .*foo"), ("trainer.devices=-5", "trainer: "),
      ("balance=magic", "balance is 'magic'"), ("init={to: x}", "init takes"),
-     ("trainer.max_epochs=-1", "fix: trainer.max_epochs=N")],
+     ("trainer.max_epochs=-1", "fix: trainer.max_epochs=N"), ("seed=abc", "seed must be a whole number .* 'abc'"),
+     ("callbacks.checkpoints.mode=minimum", "mode is 'minimum'; use max or min")],
 )  # fmt: skip
 def test_wrong_settings(override, text, run, tmp_path):
     with pytest.raises(ConfigError, match=text):
