@@ -476,7 +476,7 @@ def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecor
     content = checkpoint.read(path)
     about = checkpoint.description(content, path)
     config = evaluation_config(checkpoint.config_of(about, path), overrides)
-    wired = plan(config)
+    wired = plan(checkpoint.without_start(to_plain(config)))
     _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
     pl.seed_everything(config.seed, verbose=False)
     model = build(wired)
