@@ -6,7 +6,7 @@ import csv
 import logging
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -258,6 +258,34 @@ class MetricsFile(Logger):
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
+
+
+class Freeze(pl.Callback):
+    """Keeps parts of the model as they are: no gradients, no dropout, no new statistics of batch normalisation.
+
+    `parts` are components by name, as in `init.only`: backbone.taco. ConfigError where the model has no such part.
+    """
+
+    def __init__(self, *, parts: Sequence[str]) -> None:
+        self.parts = list(parts)
+        self._modules: list[torch.nn.Module] = []
+
+    def setup(self, trainer: pl.Trainer, pl_module: Any, stage: str) -> None:
+        """Find the parts; the optimizer, which is made later, then leaves their weights out."""
+        named = dict(pl_module.model.named_modules())
+        unknown = [part for part in self.parts if part.count(".") != 1 or part not in named]
+        if unknown or not self.parts:
+            there = [name for name in named if name.count(".") == 1 and list(named[name].parameters())]
+            wrong = f"this model has no {unknown[0]!r}" if unknown else "it is empty"
+            raise ConfigError(f"callbacks.freeze.parts: {wrong}\n  fix: some of {', '.join(there)}")
+        self._modules = [named[part] for part in self.parts]
+        for module in self._modules:
+            module.requires_grad_(False)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Into evaluation mode, to which Lightning returns after every validation."""
+        for module in self._modules:
+            module.eval()
 
 
 class SettledNorms(pl.Callback):

@@ -252,13 +252,26 @@ def load(path: str | Path, *, allow_unregistered: bool = False) -> PerceptionMod
     about = description(content, path)
     try:
         data = DataSpec.from_plain(about["data_spec"])
-        model = build(plan(config_of(about, path, allow_unregistered=allow_unregistered), data))
+        wanted = without_start(config_of(about, path, allow_unregistered=allow_unregistered))
+        model = build(plan(wanted, data))
     except (AssemblyError, ConfigError, RegistryError) as error:
         raise CheckpointError(f"{path}: its model cannot be built here: {error}") from error
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(f"{path}: its description is damaged: {type(error).__name__}: {error}") from error
     restore(model, content, path)
     return model.eval()
+
+
+def without_start(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config whose components fetch no `pretrained` weights to start from: all will come from a checkpoint."""
+
+    def kept(node: Any) -> Any:
+        return {**node, "pretrained": ""} if isinstance(node, dict) and node.get("pretrained") else node
+
+    return {
+        slot: {name: kept(node) for name, node in nodes.items()} if isinstance(nodes, dict) else nodes
+        for slot, nodes in config.items()
+    }
 
 
 def restore(model: nn.Module, content: Mapping[str, Any], path: str | Path) -> None:

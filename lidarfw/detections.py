@@ -85,8 +85,12 @@ def kitti_sequences(folder: Path) -> list[str]:
 
 
 def kitti_classes(folder: Path) -> tuple[str, ...]:
-    """The class folders; those of KITTI's benchmark in its order."""
+    """The class folders; those of KITTI's benchmark in its order. DataError where there are none."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: there is no such folder of detections, CLASS/SEQUENCE.txt")
     found = {path.name for path in folder.iterdir() if path.is_dir() and any(path.glob("*.txt"))}
+    if not found:
+        raise DataError(f"{folder}: has no detections, expected CLASS/SEQUENCE.txt, such as Car/0000.txt")
     usual = [name for name in ("Car", "Pedestrian", "Cyclist") if name in found]
     return (*usual, *sorted(found - set(usual)))
 

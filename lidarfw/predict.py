@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from lidarfw import draw, kitti
-from lidarfw.assembly import make_transforms
+from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.components.datasets.drives import read_table
 from lidarfw.data import evaluation_data
 from lidarfw.errors import ConfigError, DataError
@@ -26,6 +26,7 @@ from lidarfw.ops import transform
 from lidarfw.types import (
     Boxes,
     Camera,
+    DataSpec,
     Frame,
     FrameMeta,
     FrameResult,
@@ -122,12 +123,13 @@ class FrameReader:
         self.columns, self.repair, self.intensity_max = columns, repair, intensity_max
         self.transforms = make_transforms(model.plan.config, training=False)
         self.needed = needed_inputs(model)
+        self.given = _given(model, self.needed)  # inputs of the dataset, before the transforms
         self.left_out: tuple[str, ...] = ()  # features of the last scan that the model does not know
 
     @property
     def lidar(self) -> bool:
         """Whether the model needs scans, and not pictures alone."""
-        return any(self.data.inputs[name].kind is not Image for name in self.needed)
+        return self.given is not self.data or any(self.data.inputs[name].kind is not Image for name in self.needed)
 
     def read(self, source: Source, sequence: str = "", index: int = 0) -> Frame:
         """The frame of one source. DataError where a file is broken or is not what the model needs."""
@@ -136,10 +138,10 @@ class FrameReader:
         path, images = str(source.path), {kitti.IMAGE: str(source.image)} if source.image else {}
         meta = FrameMeta(source.id, sequence or source.id, index, index * PERIOD, cameras, path, images)
         inputs: dict[str, Any] = {}
-        for name, spec in self.data.inputs.items():
+        for name, spec in self.given.inputs.items():
             if spec.kind is Points and self.lidar:
                 inputs[name] = self._points(source, spec)
-            elif spec.kind is Image and (picture is not None or name in self.needed):
+            elif self.given is self.data and spec.kind is Image and (picture is not None or name in self.needed):
                 inputs[name] = _image(source, spec, picture, cameras)
         frame = Frame(inputs, Targets(), meta)
         for change in self.transforms:
@@ -167,6 +169,19 @@ class FrameReader:
         if missing:
             kinds = ", ".join(f"{name} ({self.data.inputs[name].kind.__name__})" for name in missing)
             raise DataError(f"{source.path}: the model also needs {kinds}, which files alone do not give")
+
+
+def _given(model: PerceptionModel, needed: set[str]) -> DataSpec:
+    """The data spec that files are read for: after the transforms, which usually add inputs to those of the dataset.
+
+    The dataset's own where transforms make what is needed of scans that they do not keep, such as panoramas.
+    """
+    data, config = model.plan.data, model.plan.config
+    if any(spec.kind is Points for spec in data.inputs.values()) or not config.get("transform"):
+        return data
+    before = make_dataset(config, config.get("splits", {}).get("train", "train")).spec
+    scans = any(spec.kind is Points for spec in before.inputs.values())
+    return before if scans and not needed <= set(before.inputs) else data
 
 
 def needed_inputs(model: PerceptionModel) -> set[str]:
@@ -203,7 +218,10 @@ def _cameras(source: Source, picture: draw.Picture | None) -> dict[str, Camera]:
 def _image(source: Source, spec: Spec, picture: draw.Picture | None, cameras: dict[str, Camera]) -> Image:
     """The picture as an input, at the size that the model learned from: smaller ones get a black border."""
     if picture is None:
-        raise DataError(f"{source.path}: the model needs a picture of the camera too\n  fix: --image FILE")
+        raise DataError(
+            f"{source.path}: the model needs a picture of the camera too\n"
+            "  fix: image_2/NAME.png beside velodyne/NAME.bin, or lidarfw predict --image FILE"
+        )
     height, width = picture.shape[:2]
     learned = spec.geometry if isinstance(spec.geometry, Camera) else None
     size = (learned.width, learned.height) if learned else (width, height)

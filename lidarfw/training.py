@@ -492,7 +492,7 @@ def evaluate(
     content = checkpoint.read(path)
     about = checkpoint.description(content, path)
     config = evaluation_config(checkpoint.config_of(about, path, allow_unregistered=allow_unregistered), overrides)
-    wired = plan(config)
+    wired = plan(checkpoint.without_start(to_plain(config)))
     _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
     _seed_everything(config.seed)
     model = build(wired)

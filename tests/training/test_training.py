@@ -312,6 +312,39 @@ def test_uncertainty_learns_its_weights(run, tmp_path):
 # --- average and start
 
 
+def test_frozen_parts_stay_as_they_are(run, tmp_path):
+    run(tmp_path / "first", "trainer.max_epochs=1")
+    start = f"init={{from: {tmp_path / 'first/checkpoints/last.ckpt'}, only: [backbone.toy]}}"
+    frozen = ["callbacks=freeze", "callbacks.freeze.parts=[backbone.toy]"]
+    settled = "+callbacks.settled={_target_: lidarfw.callbacks.SettledNorms}"
+    run(tmp_path / "second", start, *frozen, settled, "trainer.val_check_interval=2", "trainer.num_sanity_val_steps=1")
+    before, after = weights(tmp_path / "first"), weights(tmp_path / "second")
+    same = {name for name in before if torch.equal(before[name], after[name])}
+    assert same == {name for name in before if name.startswith("model.backbone.toy.")}
+    assert {name.rsplit(".", 1)[1] for name in same} >= {"weight", "running_mean", "running_var"}
+
+
+def test_frozen_parts_have_no_dropout(run, tmp_path, monkeypatch):
+    step, modes = PerceptionModule.training_step, []
+
+    def watch(self, batch, batch_idx):
+        modes.append((self.model.backbone["toy"].dropout.training, self.model.head["toy"].training))
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(PerceptionModule, "training_step", watch)
+    frozen = ["callbacks=freeze", "callbacks.freeze.parts=[backbone.toy]", "scheduler=constant"]
+    run(tmp_path, *frozen, "trainer.val_check_interval=2", "trainer.num_sanity_val_steps=1")
+    assert set(modes) == {(False, True)}
+    run(tmp_path, *frozen, "trainer.max_epochs=4", "resume=auto")
+    assert set(modes) == {(False, True)}
+
+
+@pytest.mark.parametrize(("parts", "wrong"), [("[backbone.second]", "no 'backbone.second'"), ("[]", "it is empty")])
+def test_only_parts_of_the_model_can_be_frozen(parts, wrong, run, tmp_path):
+    with pytest.raises(ConfigError, match=rf"{wrong}\n  fix: some of backbone.toy, head.toy"):
+        run(tmp_path, "callbacks=freeze", f"callbacks.freeze.parts={parts}")
+
+
 def test_ema_is_the_average_and_what_load_gives(run, tmp_path):
     run(tmp_path, "callbacks=ema", "callbacks.ema.decay=0.5", "trainer.max_epochs=1", "scheduler=constant",
         "callbacks.checkpoints.every_n_steps=1", "splits.val=null", "trainer.max_steps=2")  # fmt: skip

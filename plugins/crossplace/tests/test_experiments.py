@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import lidarfw
@@ -193,3 +194,39 @@ def test_a_part_of_a_split_may_lack_the_map(part: str, tmp_path: Path) -> None:
         f"loader.batch_size=4 trainer.max_epochs=1 trainer.accelerator=cpu logger=none hydra.run.dir={tmp_path}"
     )
     assert main(["train", *options.split(), part]) == 0
+
+
+@pytest.mark.parametrize("name", ["crossplace_kitti360", "crossplace_nclt"])
+def test_the_presets_of_the_paper_start_from_pretrained_weights(name: str) -> None:
+    backbone = config.compose([f"experiment={name}"]).backbone.cosplace
+    assert (backbone.network, backbone.pretrained, backbone.chunk) == ("resnet152", "microsoft/resnet-152", 64)
+
+
+@pytest.mark.parametrize("name", ["crossplace_kitti360", "crossplace_nclt"])
+def test_scans_alone_query_a_map(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = [f"experiment={name}", "backbone=cosplace_small", "head=place_small", "transform.panorama.width=64"]
+    options += ["backbone.cosplace.pretrained=''"]
+    wired = plan(config.compose(options))
+    weights = {f"model.{part}": value for part, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "a.ckpt")
+    (tmp_path / "scans").mkdir()
+    for number in range(3):
+        ahead, remission = np.random.default_rng(number).uniform(-20, 20, (500, 3)), np.full((500, 1), 0.5)
+        np.save(tmp_path / "scans" / f"{number}.npy", np.hstack([ahead, remission]).astype(np.float32))
+    model, scans, place = str(tmp_path / "a.ckpt"), str(tmp_path / "scans"), str(tmp_path / "map.npz")
+    assert main(["index", "build", model, scans, "-o", place]) == 0
+    assert main(["index", "query", place, model, scans, "-k", "1"]) == 0
+    found = [row for row in capsys.readouterr().out.splitlines() if "place " in row]
+    assert [row.split(" (")[0] for row in found] == [f"{number}: place {number}" for number in range(3)]
+
+
+def test_a_checkpoint_needs_no_pretrained_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ["experiment=crossplace_kitti360", "backbone=cosplace_small", "head=place_small"]
+    wired = plan(config.compose([*options, "backbone.cosplace.pretrained=''"]))
+    weights = {f"model.{part}": value for part, value in build(wired).state_dict().items()}
+    about = describe(wired) | {"config": describe(plan(config.compose(options)))["config"]}
+    torch.save({"lidarfw": about, "state_dict": weights}, tmp_path / "a.ckpt")
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ConfigError, match="needs the library transformers"):
+        build(plan(config.compose(options)))
+    assert lidarfw.load(tmp_path / "a.ckpt").backbone["cosplace"].trunk.chunk == 64

@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import itertools
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ import lidarfw
 import numpy as np
 import torch
 from lidarfw.checkpoint import config_of, description, read
+from lidarfw.cli import answered
 from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.data import evaluation_data
 from lidarfw.errors import DataError
@@ -249,7 +251,8 @@ def markdown(table: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m lidarfw_dpdc_mos.study", description=__doc__)
     parser.add_argument("checkpoint", type=Path)
@@ -272,7 +275,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(markdown(table))
     if args.json:
         write_text(args.json, json.dumps(table, indent=1) + "\n")
-    return 0
 
 
 def _light(seen: Seen) -> Seen:
@@ -281,4 +283,4 @@ def _light(seen: Seen) -> Seen:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main())

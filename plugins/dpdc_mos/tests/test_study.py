@@ -28,7 +28,7 @@ from lidarfw.types import (
 )
 
 from lidarfw_dpdc_mos.metrics import MosDetail
-from lidarfw_dpdc_mos.study import Seen, figures, fit_prior, markdown, matched_threshold, predictions, study
+from lidarfw_dpdc_mos.study import Seen, figures, fit_prior, main, markdown, matched_threshold, predictions, study
 from lidarfw_dpdc_mos.transforms import RangeProjection
 
 LABELS = Spec(PointLabels, classes=("static", "moving"))
@@ -159,3 +159,8 @@ def test_transforms_know_the_dataset_before_frames_are_read(tmp_path: Path, monk
     with pytest.raises(DataError):
         next(predictions(tmp_path / "mos.ckpt", []))
     assert calls == ["dataset", "prepare", "attach"]
+
+
+def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "no.ckpt")]) == 2
+    assert "no.ckpt" in capsys.readouterr().err

@@ -26,10 +26,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from lidarfw import checkpoint
+from lidarfw.cli import answered
 from lidarfw.components.metrics.box_ap import BoxAP
 from lidarfw.components.postprocessors.nms import NMS
 from lidarfw.data import evaluation_data
-from lidarfw.errors import ConfigError, LidarfwError
+from lidarfw.errors import ConfigError
 from lidarfw.evaluation import evaluation_config
 from lidarfw.files import atomic_path, require_checkpoint, write_text
 from lidarfw.interfaces import Dataset, Metric, Transform
@@ -224,8 +225,9 @@ def _outline(box: torch.Tensor) -> tuple[list[float], list[float]]:
     return corners[:, 0].tolist(), corners[:, 1].tolist()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; its exit code."""
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", metavar="CKPT")
     parser.add_argument("overrides", metavar="OVERRIDE", nargs="*", help="of `lidarfw eval`")
@@ -235,28 +237,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pictures", type=Path, metavar="DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     given = parser.parse_args(arguments)
-    try:
-        require_checkpoint(given.checkpoint)
-        model = checkpoint.load(given.checkpoint).eval()
-        classes, stages = model.plan.data.classes, _stages(model)
-        seen = list(run(model, *data_of(given.checkpoint, given.overrides)))
-        frames = {name: measured(seen, classes, chosen) for name, chosen in ways(stages).items()}
-        found = {name: figures(joined(parts)) for name, parts in frames.items()}
-        few = {f"vote, {n} regions": figures(joined(measured(seen, classes, (), n))) for n in given.regions}
-        print(table(found | few, classes))
-        if given.resamples:
-            meta = [one.meta for one in seen]
-            drawn = {name: resampled(parts, meta, given.resamples, given.block) for name, parts in frames.items()}
-            print(f"\n{differences(found, drawn)}")
-        if given.json:
-            write_text(given.json, json.dumps(found | few, indent=1) + "\n")
-        if given.pictures:
-            for one in seen:
-                draw(given.pictures / f"{one.meta.id.replace('/', '_')}_stages.png", one, stages)
-    except LidarfwError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+    require_checkpoint(given.checkpoint)
+    model = checkpoint.load(given.checkpoint).eval()
+    classes, stages = model.plan.data.classes, _stages(model)
+    seen = list(run(model, *data_of(given.checkpoint, given.overrides)))
+    frames = {name: measured(seen, classes, chosen) for name, chosen in ways(stages).items()}
+    found = {name: figures(joined(parts)) for name, parts in frames.items()}
+    few = {f"vote, {n} regions": figures(joined(measured(seen, classes, (), n))) for n in given.regions}
+    print(table(found | few, classes))
+    if given.resamples:
+        meta = [one.meta for one in seen]
+        drawn = {name: resampled(parts, meta, given.resamples, given.block) for name, parts in frames.items()}
+        print(f"\n{differences(found, drawn)}")
+    if given.json:
+        write_text(given.json, json.dumps(found | few, indent=1) + "\n")
+    if given.pictures:
+        for one in seen:
+            draw(given.pictures / f"{one.meta.id.replace('/', '_')}_stages.png", one, stages)
 
 
 def _stages(model: PerceptionModel) -> int:
