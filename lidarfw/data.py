@@ -260,21 +260,24 @@ class FrameLoader(DataLoader[Batch]):
         epoch, position = self.resume or (0, 0)
         self.resume = None
         self.order.start = self.position = position if epoch == self.order.epoch else 0
-        batches = super().__iter__()
-        for place in range(self.position, len(self)):
-            loaded = self._next(batches)
-            self._judge(loaded.bad)
-            self.position = place + 1
-            if loaded.batch is not None:
-                yield loaded.batch
+        try:  # around all of it: torch raises wherever the program is when it hears of the death of a worker
+            batches = super().__iter__()
+            for place in range(self.position, len(self)):
+                loaded = self._next(batches)
+                self._judge(loaded.bad)
+                self.position = place + 1
+                if loaded.batch is not None:
+                    yield loaded.batch
+        except LidarfwError:
+            raise
+        except (RuntimeError, OSError, EOFError, MemoryError) as error:
+            raise self.failure(error) from error
 
     def _next(self, batches: Iterator[Any]) -> Loaded:
         try:
             return next(batches)  # type: ignore[no-any-return]
         except LidarfwError as error:
             raise type(error)(_last_lines(error)) from error
-        except (RuntimeError, OSError, EOFError, MemoryError) as error:
-            raise self.failure(error) from error
 
     def failure(self, error: Exception) -> DataError:
         """What it means that workers failed while the next batch was prepared. Ends the others."""
