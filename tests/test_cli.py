@@ -2,7 +2,8 @@
 
 import pytest
 
-from lidarfw.cli import parse
+from lidarfw.cli import answered, parse
+from lidarfw.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -21,3 +22,13 @@ def test_what_a_command_does_not_know_is_an_error(words, capsys):
         parse(words.split())
     assert stop.value.code == 2
     assert "unrecognized arguments: " in capsys.readouterr().err
+
+
+def test_a_command_of_a_plugin_answers_as_these_do(capsys: pytest.CaptureFixture[str]) -> None:
+    @answered
+    def command(fails: bool) -> None:
+        if fails:
+            raise ConfigError("key is wrong\n  fix: another")
+
+    assert (command(False), command(fails=True)) == (0, 2)
+    assert capsys.readouterr().err == "key is wrong\n  fix: another\n"
