@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from lidarfw import registry
-from lidarfw.cli import main, parse
+from lidarfw.cli import answered, main, parse
 from lidarfw.config import jobs_to_compose
+from lidarfw.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -68,3 +69,13 @@ def test_a_broken_pyproject_is_pointed_out_and_the_others_work(capsys, tmp_path,
     monkeypatch.chdir(tmp_path)
     assert main(["check"]) == 2
     assert "pyproject.toml is no TOML" in capsys.readouterr().err
+
+
+def test_a_command_of_a_plugin_answers_as_these_do(capsys: pytest.CaptureFixture[str]) -> None:
+    @answered
+    def command(fails: bool) -> None:
+        if fails:
+            raise ConfigError("key is wrong\n  fix: another")
+
+    assert (command(False), command(fails=True)) == (0, 2)
+    assert capsys.readouterr().err == "key is wrong\n  fix: another\n"

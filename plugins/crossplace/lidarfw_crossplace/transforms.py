@@ -268,11 +268,11 @@ class Panorama(Transform):
         stitcher, pictures = self._pictures(frame, view=whole)
         picture, crop = stitcher.blend(pictures), panorama.stitcher(self.view, (panorama.camera_of(whole),), math.pi)
         said = networks.Said()
-        if "depth" in self._asked:
+        if "depth" in self.maps and self._depth_network:
             inverse = crop.blend([self._depth_network(picture)[None]])[0]
             covered = crop.blend([stitcher.covered[None].float()])[0] > 0.5
             said.depth = self._filled(panorama.depth_from_inverse(inverse, covered & ~self._ego)[None])[0]
-        if "semantics" in self._asked:
+        if "semantics" in self.maps and self._semantics_network:
             said.classes = crop.pick([self._semantics_network(picture)[None].float()])[0].to(torch.uint8)
         if "intensity" in self._asked:
             said.intensity = self._grey(frame)[0]
