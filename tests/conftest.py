@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from lidarfw import registry
 from lidarfw.interfaces import Dataset, Transform
 from lidarfw.types import Frame
 
@@ -67,9 +67,7 @@ class Told(Transform):
 
 
 @pytest.fixture
-def told(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def told() -> Iterator[list[str]]:
     """Overrides that add the transform `Told`."""
-    module = ModuleType("lidarfw_told")
-    module.Told = Told  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "lidarfw_told", module)
-    return ["+transform.told.type=lidarfw_told:Told"]
+    with registry.use(transform={"told": Told}):
+        yield ["+transform.told.type=told"]
