@@ -123,17 +123,16 @@ def make_dataset(config: Mapping[str, Any] | DictConfig, split: str) -> Dataset:
     return dataset
 
 
-def transform_names(config: Mapping[str, Any] | DictConfig, training: bool) -> list[str]:
-    """Names of the transforms that `make_transforms` gives, in order."""
-    nodes = _nodes(_plain(config), "transform", [])
-    return [name for name, node in nodes if training or not registry.load("transform", node["type"]).train_only]
-
-
 def make_transforms(config: Mapping[str, Any] | DictConfig, training: bool) -> list[Transform]:
     """The transforms of a config in order; without augmentations unless `training`."""
-    plain = _plain(config)
-    made: list[Transform] = [_create("transform", name, node) for name, node in _nodes(plain, "transform", [])]
-    return [t for t in made if training or not t.train_only]
+    return list(named_transforms(config, training).values())
+
+
+def named_transforms(config: Mapping[str, Any] | DictConfig, training: bool) -> dict[str, Transform]:
+    """Those of `make_transforms` by name."""
+    nodes = _nodes(_plain(config), "transform", [])
+    made: dict[str, Transform] = {name: _create("transform", name, node) for name, node in nodes}
+    return {name: transform for name, transform in made.items() if training or not transform.train_only}
 
 
 def _create(slot: str, name: str, node: Mapping[str, Any]) -> Any:
@@ -504,7 +503,7 @@ def _build_step(step: Step, specs: dict[tuple[str, Any, str], Any], data: DataSp
     cls = registry.load(step.slot, step.declared.entry.name)
     try:
         return cls(**arguments, **step.options)
-    except (ValueError, LidarfwError) as error:
+    except (ValueError, RuntimeError, LidarfwError) as error:  # RuntimeError: torch's, of a size that cannot be
         kind = type(error) if isinstance(error, LidarfwError) else AssemblyError
         raise kind(f"{step.id}: {error}") from error
 

@@ -6,7 +6,7 @@ import csv
 import logging
 import signal
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -15,8 +15,9 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.callbacks import Checkpoint
 from lightning.pytorch.loggers.logger import Logger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
 
+from lidarfw.errors import ConfigError
 from lidarfw.files import atomic_path
 from lidarfw.types import collate
 
@@ -35,7 +36,9 @@ class Checkpoints(Checkpoint):
     def __init__(self, *, every_n_steps: int = 500, monitor: str | None = None, mode: str = "max") -> None:
         self.every_n_steps = every_n_steps
         self.monitor = monitor  # default: what the model names, see PerceptionModel.monitor
-        self.sign = {"max": 1.0, "min": -1.0}[mode]
+        if mode not in ("max", "min"):
+            raise ConfigError(f"callbacks.checkpoints.mode is {mode!r}; use max or min")
+        self.sign = 1.0 if mode == "max" else -1.0
         self.best: float | None = None
         self.saved_at = 0  # global step of last.ckpt
         self.folder = Path("checkpoints")
@@ -68,6 +71,9 @@ class Checkpoints(Checkpoint):
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Save the best."""
         figure = trainer.callback_metrics.get(self.monitor or "")
+        if self.monitor and figure is None and not trainer.sanity_checking:
+            names = ", ".join(name for name in trainer.callback_metrics if name.startswith("val/")) or "none"
+            rank_zero_warn(f"no best.ckpt: there is no figure {self.monitor!r} to monitor.\n  there are: {names}")
         if not _in_training(trainer) or figure is None or torch.isnan(figure):
             return
         value = float(figure)
@@ -252,6 +258,34 @@ class MetricsFile(Logger):
             writer = csv.DictWriter(file, self._columns)
             writer.writeheader()
             writer.writerows(rows)
+
+
+class Freeze(pl.Callback):
+    """Keeps parts of the model as they are: no gradients, no dropout, no new statistics of batch normalisation.
+
+    `parts` are components by name, as in `init.only`: backbone.taco. ConfigError where the model has no such part.
+    """
+
+    def __init__(self, *, parts: Sequence[str]) -> None:
+        self.parts = list(parts)
+        self._modules: list[torch.nn.Module] = []
+
+    def setup(self, trainer: pl.Trainer, pl_module: Any, stage: str) -> None:
+        """Find the parts; the optimizer, which is made later, then leaves their weights out."""
+        named = dict(pl_module.model.named_modules())
+        unknown = [part for part in self.parts if part.count(".") != 1 or part not in named]
+        if unknown or not self.parts:
+            there = [name for name in named if name.count(".") == 1 and list(named[name].parameters())]
+            wrong = f"this model has no {unknown[0]!r}" if unknown else "it is empty"
+            raise ConfigError(f"callbacks.freeze.parts: {wrong}\n  fix: some of {', '.join(there)}")
+        self._modules = [named[part] for part in self.parts]
+        for module in self._modules:
+            module.requires_grad_(False)
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Into evaluation mode, to which Lightning returns after every validation."""
+        for module in self._modules:
+            module.eval()
 
 
 class SettledNorms(pl.Callback):

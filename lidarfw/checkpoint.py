@@ -1,7 +1,7 @@
 """Checkpoints that describe themselves: weights, resolved config, data spec and versions, in plain types only.
 
 `load` rebuilds the model from the file alone. Nothing in a checkpoint can run code: files are read with
-`weights_only=True`, and a config can name registered components only.
+`weights_only=True`, and a config can name components of installed plugins only.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ import yaml
 from lightning.pytorch.plugins import TorchCheckpointIO
 from torch import Tensor, nn
 
+from lidarfw import registry
 from lidarfw.errors import AssemblyError, CheckpointError, ConfigError, DataError, RegistryError
 from lidarfw.files import atomic_path, require_checkpoint
+from lidarfw.interfaces import SLOTS
 from lidarfw.types import DataSpec
 
 if TYPE_CHECKING:
@@ -85,15 +87,33 @@ def _check_distributions(about: Mapping[str, Any], path: str | Path) -> None:
             log.warning("%s was written with %s %s, installed is %s", path, name, version, installed)
 
 
-def config_of(about: Mapping[str, Any], path: str | Path) -> dict[str, Any]:
-    """The resolved config of a description."""
+def config_of(about: Mapping[str, Any], path: str | Path, *, allow_unregistered: bool = False) -> dict[str, Any]:
+    """The resolved config of a description; CheckpointError where it could have foreign code imported.
+
+    `allow_unregistered` takes classes "package.module:Class" of any package: only for a file that one trusts.
+    """
     try:
         config = yaml.safe_load(about["config"])
     except yaml.YAMLError as error:
         raise CheckpointError(f"{path}: its config is no YAML: {str(error).splitlines()[0]}") from error
     if not isinstance(config, dict):
         raise CheckpointError(f"{path}: its config is a {type(config).__name__}, expected a mapping")
+    if not allow_unregistered:
+        _check_components(config, path)
     return config
+
+
+def _check_components(config: Mapping[str, Any], path: str | Path) -> None:
+    for slot in SLOTS:
+        nodes = config.get(slot)
+        for name, node in nodes.items() if isinstance(nodes, dict) else ():
+            kind = node.get("type", "") if isinstance(node, dict) else ""
+            if not isinstance(kind, str) or not registry.trusted(kind):
+                raise CheckpointError(
+                    f"{path}: {slot}.{name} is {kind!r}, of no installed plugin; it was not imported, since that could "
+                    "run code.\n  fix: install the plugin that ships the class (`lidarfw new` starts one); or, for a "
+                    "file that you trust,\n  in Python: lidarfw.load(path, allow_unregistered=True)"
+                )
 
 
 # --- reading and writing --------------------------------------------------------------------------------------------
@@ -219,29 +239,39 @@ def _check_space(path: Path, checkpoint: Mapping[str, Any]) -> None:
 # --- models ---------------------------------------------------------------------------------------------------------
 
 
-def load(path: str | Path) -> PerceptionModel:
+def load(path: str | Path, *, allow_unregistered: bool = False) -> PerceptionModel:
     """The trained model in a .ckpt or .safetensors file, in evaluation mode, on the CPU.
 
-    A run with EMA gives the averaged weights. Raises CheckpointError: file damaged, foreign or hostile, a
-    distribution missing, format newer, weights that do not fit.
+    A run with EMA gives the averaged weights. `allow_unregistered` imports classes "package.module:Class" of any
+    package, such as your own script: only for a file that you trust. Raises CheckpointError: file damaged, foreign or
+    hostile, a distribution missing, format newer, weights that do not fit.
     """
-    content = read(path)
-    return model_of(content, description(content, path), path)
-
-
-def model_of(content: Mapping[str, Any], about: Mapping[str, Any], path: str | Path) -> PerceptionModel:
-    """The model of a checkpoint that was read and checked already."""
     from lidarfw.assembly import build, plan
 
+    content = read(path)
+    about = description(content, path)
     try:
         data = DataSpec.from_plain(about["data_spec"])
-        model = build(plan(config_of(about, path), data))
+        wanted = without_start(config_of(about, path, allow_unregistered=allow_unregistered))
+        model = build(plan(wanted, data))
     except (AssemblyError, ConfigError, RegistryError) as error:
         raise CheckpointError(f"{path}: its model cannot be built here: {error}") from error
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise CheckpointError(f"{path}: its description is damaged: {type(error).__name__}: {error}") from error
     restore(model, content, path)
     return model.eval()
+
+
+def without_start(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A config whose components fetch no `pretrained` weights to start from: all will come from a checkpoint."""
+
+    def kept(node: Any) -> Any:
+        return {**node, "pretrained": ""} if isinstance(node, dict) and node.get("pretrained") else node
+
+    return {
+        slot: {name: kept(node) for name, node in nodes.items()} if isinstance(nodes, dict) else nodes
+        for slot, nodes in config.items()
+    }
 
 
 def restore(model: nn.Module, content: Mapping[str, Any], path: str | Path) -> None:

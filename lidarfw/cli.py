@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import ModuleType
+from typing import ParamSpec
 
 import lidarfw
 from lidarfw.errors import LidarfwError
+
+P = ParamSpec("P")
 
 COMMANDS = {
     "train": "train a model: components and settings as overrides (head=center optimizer.lr=0.01)",
@@ -93,6 +97,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `lidarfw list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def answered(command: Callable[P, int | None]) -> Callable[P, int]:
+    """For the `main` of a module that is run by `python -m`: its exit code, 0, or 2 with the message of an error that
+    the user can mend."""
+
+    @functools.wraps(command)
+    def run(*args: P.args, **kwargs: P.kwargs) -> int:
+        try:
+            return command(*args, **kwargs) or 0
+        except LidarfwError as error:
+            print(error, file=sys.stderr)
+            return 2
+
+    return run
 
 
 def run() -> None:

@@ -12,7 +12,7 @@ import importlib
 import inspect
 import re
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, cast, get_args, get_origin
 
@@ -22,6 +22,7 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob, Override
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
@@ -36,6 +37,7 @@ from lidarfw.interfaces import SLOTS
 
 RESERVED = ("type", "inputs")  # keys of every component node
 LOSS_RESERVED = ("weight", "ramp")  # of loss nodes too
+_GROUPS = ("trainer", "optimizer", "scheduler", "callbacks", "logger", "experiment", "debug")  # beside the slots
 _ALLOWED_TARGETS = ("torch.optim.", "lightning.pytorch.", "lightning.fabric.plugins.", "lidarfw.callbacks.")
 _ALLOWED_BASES = {
     "torch.optim": ("Optimizer",),
@@ -183,11 +185,28 @@ def with_config_dirs(arguments: list[str]) -> list[str]:
     )
 
 
-def without_sweeps(arguments: list[str]) -> list[str]:
-    """The overrides that all jobs of a sweep share: no flags, no `seed=1,2`."""
+def jobs_to_compose(arguments: list[str]) -> Iterator[list[str]]:
+    """Overrides of jobs of a sweep that hold every choice of a group between them: `head=a,b seed=1,2` gives two."""
     overrides = [argument for argument in arguments if not argument.startswith("-")]
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    return [text for text, override in zip(overrides, parsed, strict=True) if not override.is_sweep_override()]
+    try:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+    except HydraException as error:
+        raise explain(error, overrides) from error
+    rows = [(o.key_or_group, _values(o)) for o in parsed]
+    first = [values[:1] for _, values in rows]
+    yield [text for values in first for text in values]
+    for place, (key, values) in enumerate(rows):
+        for value in values[1:] if key in (*SLOTS, *_GROUPS) else ():
+            yield [text for chosen in (*first[:place], [value], *first[place + 1 :]) for text in chosen]
+
+
+def _values(override: Override) -> list[str]:
+    """The overrides that stand for one, several for a sweep; none where only the sweeper knows them."""
+    if not override.is_sweep_override():
+        return [override.input_line or ""]
+    listed = override.is_discrete_sweep() and not isinstance(override.value(), Glob)
+    values = override.sweep_string_iterator() if listed else ()
+    return [f"{override.get_key_element()}={value}" for value in values]
 
 
 def explain(error: HydraException, overrides: list[str]) -> LidarfwError:
@@ -247,8 +266,7 @@ def _override_error(error: HydraException) -> str:
 
 
 def _top_keys() -> list[str]:
-    groups = ["trainer", "optimizer", "scheduler", "callbacks", "logger", "experiment", "debug"]
-    return ["name", "seed", "loader", "splits", "balance", "init", "resume", *groups]
+    return ["name", "seed", "loader", "splits", "balance", "init", "resume", *_GROUPS]
 
 
 def to_plain(config: DictConfig) -> dict[str, Any]:
@@ -290,7 +308,7 @@ def _check_targets(node: Any) -> None:
 
 def check_target(target: Any) -> None:
     """ConfigError unless `target` names a class that a config may build."""
-    prefixes = (*_ALLOWED_TARGETS, *_plugin_modules())
+    prefixes = (*_ALLOWED_TARGETS, *(f"{package}." for package in sorted(registry.packages() - {"lidarfw"})))
     refused = ConfigError(
         f"_target_ {str(target)[:80]!r} is not allowed in a config.\n  a config may build optimizers, schedulers, "
         f"trainers, loggers, callbacks, strategies and profilers from: {', '.join(prefixes)}\n"
@@ -309,11 +327,6 @@ def check_target(target: Any) -> None:
         raise refused
     if not f"{found.__module__}.".startswith(("torch.optim.", "lightning.", "lidarfw.", *prefixes)):
         raise refused  # an allowed module that re-exports a foreign class
-
-
-def _plugin_modules() -> list[str]:
-    modules = {e.value.partition(":")[0].partition(".")[0] for slot in SLOTS for e in registry.entries(slot)}
-    return sorted(f"{module}." for module in modules - {"lidarfw", "__main__"})
 
 
 def _allowed_bases() -> tuple[type, ...]:

@@ -260,21 +260,24 @@ class FrameLoader(DataLoader[Batch]):
         epoch, position = self.resume or (0, 0)
         self.resume = None
         self.order.start = self.position = position if epoch == self.order.epoch else 0
-        batches = super().__iter__()
-        for place in range(self.position, len(self)):
-            loaded = self._next(batches)
-            self._judge(loaded.bad)
-            self.position = place + 1
-            if loaded.batch is not None:
-                yield loaded.batch
+        try:  # around all of it: torch raises wherever the program is when it hears of the death of a worker
+            batches = super().__iter__()
+            for place in range(self.position, len(self)):
+                loaded = self._next(batches)
+                self._judge(loaded.bad)
+                self.position = place + 1
+                if loaded.batch is not None:
+                    yield loaded.batch
+        except LidarfwError:
+            raise
+        except (RuntimeError, OSError, EOFError, MemoryError) as error:
+            raise self.failure(error) from error
 
     def _next(self, batches: Iterator[Any]) -> Loaded:
         try:
             return next(batches)  # type: ignore[no-any-return]
         except LidarfwError as error:
             raise type(error)(_last_lines(error)) from error
-        except (RuntimeError, OSError, EOFError, MemoryError) as error:
-            raise self.failure(error) from error
 
     def failure(self, error: Exception) -> DataError:
         """What it means that workers failed while the next batch was prepared. Ends the others."""
@@ -382,15 +385,12 @@ class DataModule(pl.LightningDataModule):
     def prepare_data(self) -> None:
         """Let datasets and transforms get their files ready; Lightning calls this on one process per node."""
         for name, dataset in self.datasets.items():
-            dataset.prepare()
-            for transform in self.transforms[name]:
-                transform.prepare(dataset, max(self.workers, 1))
+            _prepare(dataset, self.transforms[name], max(self.workers, 1))
 
     def setup(self, stage: str) -> None:
         """Tell the transforms which dataset they work on."""
         for name, dataset in self.datasets.items():
-            for transform in self.transforms[name]:
-                transform.attach(dataset)
+            _attach(dataset, self.transforms[name])
 
     def train_dataloader(self) -> FrameLoader:
         """Every clip once per epoch, in the order of (seed, epoch)."""
@@ -477,6 +477,32 @@ class DataModule(pl.LightningDataModule):
     def world(self) -> int:
         """Processes of the run."""
         return self.trainer.world_size if self.trainer else 1
+
+
+def _prepare(dataset: Dataset, transforms: Sequence[Transform], workers: int = 1) -> None:
+    dataset.prepare()
+    for transform in transforms:
+        transform.prepare(dataset, workers)
+
+
+def _attach(dataset: Dataset, transforms: Sequence[Transform]) -> None:
+    for transform in transforms:
+        transform.attach(dataset)
+
+
+def make_ready(dataset: Dataset, transforms: Sequence[Transform]) -> None:
+    """Get the files of a dataset and its transforms ready, and tell these what they work on, as a `DataModule` does."""
+    _prepare(dataset, transforms)
+    _attach(dataset, transforms)
+
+
+def evaluation_data(config: Mapping[str, Any] | DictConfig, split: str) -> tuple[Dataset, list[Transform]]:
+    """The dataset of a config for one split and its transforms of evaluation, ready to be read one by one."""
+    from lidarfw.assembly import make_dataset, make_transforms
+
+    dataset, transforms = make_dataset(config, split), make_transforms(config, training=False)
+    make_ready(dataset, transforms)
+    return dataset, transforms
 
 
 def _at_least(key: str, value: Any, least: int) -> Any:

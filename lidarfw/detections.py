@@ -22,7 +22,7 @@ from lidarfw import kitti, nuscenes
 from lidarfw._lazy import LazyModule
 from lidarfw.components.datasets.drives import read_poses
 from lidarfw.errors import DataError
-from lidarfw.files import write_text
+from lidarfw.files import natural, write_text
 from lidarfw.types import Boxes, Camera, FrameMeta, Poses, Tracks
 
 if TYPE_CHECKING:
@@ -85,8 +85,12 @@ def kitti_sequences(folder: Path) -> list[str]:
 
 
 def kitti_classes(folder: Path) -> tuple[str, ...]:
-    """The class folders; those of KITTI's benchmark in its order."""
+    """The class folders; those of KITTI's benchmark in its order. DataError where there are none."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: there is no such folder of detections, CLASS/SEQUENCE.txt")
     found = {path.name for path in folder.iterdir() if path.is_dir() and any(path.glob("*.txt"))}
+    if not found:
+        raise DataError(f"{folder}: has no detections, expected CLASS/SEQUENCE.txt, such as Car/0000.txt")
     usual = [name for name in ("Car", "Pedestrian", "Cyclist") if name in found]
     return (*usual, *sorted(found - set(usual)))
 
@@ -187,11 +191,11 @@ def mean_scores(frames: Sequence[Tracks]) -> dict[int, float]:
 
 
 def read_json(folder: Path) -> tuple[DetectedSequence, tuple[str, ...]]:
-    """The files of a folder in the order of their names, as one sequence, and the classes.
+    """The files of a folder in the order of their names (2 before 10), as one sequence, and the classes.
 
     As `lidarfw predict` writes them; a file may also have `time` (seconds) and `pose` (4 x 4, sensor to map).
     """
-    paths = sorted(folder.glob("*.json"))
+    paths = sorted(folder.glob("*.json"), key=lambda path: natural(path.name))
     if not paths:
         raise DataError(f"{folder}: expected .json files of `lidarfw predict`, found none.")
     plain = [(path, _load(path)) for path in paths]
@@ -216,18 +220,39 @@ def _key(value: Any, key: str, path: Path) -> Any:
 
 def _json_frame(path: Path, value: Any, index: int, sequence: str, classes: Sequence[str]) -> Detections:
     predictions = _key(value, "predictions", path)
-    rows = [row for found in predictions.values() if found.get("kind") == "Boxes" for row in found["boxes"]]
     try:
-        table = np.array([[*row["center"], *row["size"], row["yaw"]] for row in rows], dtype=np.float64)
-        label = [classes.index(row["class"]) for row in rows]
-        boxes = boxes_of(table, label, [float(row["score"]) for row in rows])
-        if rows and all("velocity" in row for row in rows):
-            boxes = boxes.replace(velocity=torch.tensor([row["velocity"] for row in rows], dtype=torch.float64))
-        pose = None if value.get("pose") is None else pose_of(np.array(value["pose"], dtype=np.float64).reshape(4, 4))
-        time = float(value.get("time", index * PERIOD))
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path}: expected boxes with class, score, center, size, yaw: {error!r}") from error
+        rows = [row for found in predictions.values() if found.get("kind") == "Boxes" for row in found["boxes"]]
+        boxes = _json_boxes(rows, classes)
+        pose = None if value.get("pose") is None else pose_of(_numbers(value["pose"], (4, 4)))
+        time = float(_numbers(value.get("time", index * PERIOD), ()))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(
+            f"{path}: expected boxes with class, score, center, size, yaw: {type(error).__name__}: {error}"
+        ) from error
     return Detections(FrameMeta(str(value.get("id", path.stem)), sequence, index, time), boxes, pose)
+
+
+def _json_boxes(rows: Sequence[Any], classes: Sequence[str]) -> Boxes:
+    if not rows:
+        return boxes_of(np.zeros((0, 7)), [], [])
+    table = _numbers([[*row["center"], *row["size"], row["yaw"], row["score"]] for row in rows], (len(rows), 8))
+    if (table[:, 3:6] <= 0).any():
+        raise ValueError(f"size must be above 0, found {table[(table[:, 3:6] <= 0).any(1).argmax(), 3:6].tolist()}")
+    unknown = sorted({str(row["class"]) for row in rows} - set(classes))
+    if unknown:
+        raise ValueError(f"class {unknown[0]!r} is none of {', '.join(classes)}")
+    boxes = boxes_of(table[:, :7], [classes.index(row["class"]) for row in rows], table[:, 7].tolist())
+    if all("velocity" in row for row in rows):
+        return boxes.replace(velocity=torch.from_numpy(_numbers([row["velocity"] for row in rows], (len(rows), 2))))
+    return boxes
+
+
+def _numbers(value: Any, shape: tuple[int, ...]) -> Array:
+    """ValueError unless they are finite and as many as the shape says."""
+    numbers: Array = np.array(value, dtype=np.float64)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise ValueError(f"expected finite numbers of shape {shape}, found {value}")
+    return numbers
 
 
 def write_json(folder: Path, frames: Sequence[tuple[FrameMeta, Tracks]], classes: Sequence[str]) -> None:

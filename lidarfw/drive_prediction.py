@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from lidarfw.components.datasets.drives import merge_scans, pose_of, read_scan
 from lidarfw.components.datasets.semantic_kitti import label_ids, read_sequence
 from lidarfw.errors import DataError
 from lidarfw.files import atomic_path
+from lidarfw.io import usable_points
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import transform
 from lidarfw.predict import needed_inputs
@@ -31,17 +33,18 @@ class SequenceFrames(Sequence[Frame]):
     """The frames of a folder in SemanticKITTI's layout: velodyne/, poses.txt, calib.txt, times.txt; no labels needed.
 
     Each frame has the scans and inputs that the model learned from, past scans moved into its frame by the poses, and
-    went through the model's transforms. A scan is read once for all frames that follow each other.
+    went through the model's transforms. A scan is read once for all frames that follow each other; `repair` drops its
+    points that are not finite.
     """
 
-    def __init__(self, model: PerceptionModel, folder: Path) -> None:
+    def __init__(self, model: PerceptionModel, folder: Path, repair: bool = False) -> None:
         self.drive = read_sequence(folder.absolute())
         self.data = model.plan.data
         pictures = [n for n in needed_inputs(model) if self.data.inputs[n].kind is Image]
         if pictures:
             raise DataError(f"the model also needs {pictures[0]} (Image), which is not read from a sequence of scans")
         self.transforms = make_transforms(model.plan.config, training=False)
-        self._scan = functools.lru_cache(maxsize=self.data.sweeps)(read_scan)
+        self._scan = functools.lru_cache(maxsize=self.data.sweeps)(functools.partial(read_scan, repair=repair))
 
     def __len__(self) -> int:
         return len(self.drive.scans)
@@ -83,13 +86,23 @@ def labels_of(result: FrameResult) -> PointLabels:
 def save_labels(result: FrameResult, folder: Path, classes: Sequence[str]) -> Path:
     """Write FOLDER/sequences/SEQUENCE/predictions/ID.label, as the evaluation of SemanticKITTI takes it.
 
-    One uint32 per point of the scan; a moving point is 251 and a static one 9.
+    One uint32 per point of the scan; a moving point is 251 and a static one 9, one that was dropped as broken 0.
     """
-    ids = label_ids(classes)[labels_of(result).label.numpy()]
+    ids = _of_the_file(label_ids(classes)[labels_of(result).label.numpy()], result.meta.path)
     path = folder / "sequences" / result.meta.sequence / "predictions" / f"{result.meta.id}.label"
     with atomic_path(path) as temporary:
         ids.tofile(temporary)
     return path
+
+
+def _of_the_file(ids: npt.NDArray[np.uint32], scan: str) -> npt.NDArray[np.uint32]:
+    """The ids of the points of a scan file, 0 for those that `repair` has dropped."""
+    kept = usable_points(scan) if scan else np.ones(len(ids), dtype=bool)
+    if kept.all() or kept.sum() != len(ids):
+        return ids
+    spread = np.zeros(len(kept), dtype=ids.dtype)
+    spread[kept] = ids
+    return spread
 
 
 class Strip:

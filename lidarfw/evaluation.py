@@ -16,13 +16,14 @@ LEARNED_KEYS = ("backbone", "neck", "head", "loss", "balance")
 BROUGHT_KEYS = ("postprocessor", "metric")
 MODEL_KEYS = (*LEARNED_KEYS, "postprocessor", "filter", "tracker", "retriever")
 TRAINING_KEYS = ("optimizer", "scheduler", "init", "resume")  # of no use in an evaluation
+GLOBAL_KEYS = ("experiment", "debug")  # options of these set other keys
 
 
 def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
     """The config of a checkpoint with overrides; groups (`dataset=NAME`) are composed, keys are set.
 
-    What comes after the heads may change too (`filter=NAME`, `postprocessor.nms.iou=0.5`), as far as the weights of
-    the checkpoint still fit.
+    What comes after the heads may change too (`filter=NAME`, `postprocessor.nms.iou_threshold=0.5`), as far as the
+    weights of the checkpoint still fit.
     """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -30,6 +31,11 @@ def evaluation_config(stored: Mapping[str, Any], overrides: Sequence[str]) -> Di
         raise ConfigError(f"cannot read the overrides: {error}") from error
     for override in parsed:
         _refuse(override.key_or_group, override.input_line or "")
+        if override.is_delete() and override.key_or_group in BROUGHT_KEYS:
+            raise ConfigError(
+                f"{override.input_line} has no effect: where none is chosen, the heads bring their own.\n"
+                f"  fix: {override.key_or_group}=NAME"
+            )
     groups = [o for o in parsed if _selects(o, stored)]
     composed = compose([str(o.input_line) for o in groups])
     progress = {name: node for name, node in (stored.get("callbacks") or {}).items() if name == "progress"}
@@ -56,6 +62,11 @@ def _refuse(key: str, line: str) -> None:
             "  an evaluation can change: dataset, transform, metric, loader, splits, trainer, seed; and what comes\n"
             "  after the heads: postprocessor, filter, tracker, retriever\n"
             f"  fix: train with {line}"
+        )
+    if root in GLOBAL_KEYS:
+        raise ConfigError(
+            f"{line}: the config comes from the checkpoint, {root} would set parts of the model too.\n"
+            "  fix: the keys that are to change, one by one, such as dataset=NAME splits.test=val"
         )
     if root in TRAINING_KEYS:
         raise ConfigError(f"{line}: an evaluation does not train, {root} has no effect.\n  fix: leave it out")

@@ -1,8 +1,9 @@
-"""Files: none half-written under its final name, and a clear message where a checkpoint is not there."""
+"""Files: none half-written under its final name, natural order, and a message where a checkpoint is not there."""
 
 from __future__ import annotations
 
 import os
+import re
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,6 +38,11 @@ def write_text(path: str | Path, text: str) -> None:
     """Write `text` as UTF-8, atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Key of the order in which scan_2 comes before scan_10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def require_checkpoint(path: str | Path) -> None:

@@ -33,13 +33,25 @@ def read_points(path: str | Path, columns: int | None = None, repair: bool = Fal
     `repair` drops points that are not finite, or farther than 100 km, which else are an error.
     Raises DataError for a file that is missing, unreadable, empty, cut off or of another format.
     """
-    path = Path(path)
+    return _checked(Path(path), _read(Path(path), columns), repair)
+
+
+def usable_points(path: str | Path, columns: int | None = None) -> np.ndarray:
+    """(N,) which points of a file `repair` keeps. DataError as `read_points`."""
+    return _usable(_read(Path(path), columns))
+
+
+def _read(path: Path, columns: int | None) -> Scan:
     reader = SCAN_READERS.get(path.suffix.lower())
     if reader is None:
         raise DataError(f"{path}: no scan format has the suffix {path.suffix!r}; there are {', '.join(SCAN_READERS)}")
     data = _read_bytes(path)
-    scan = _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
-    return _checked(path, scan, repair)
+    try:
+        return _read_bin(path, data, columns) if reader is _read_bin else reader(path, data)
+    except (ValueError, TypeError, OverflowError) as error:  # numpy refuses what the header says in many ways
+        raise DataError(
+            f"{path}: is not a readable {path.suffix} file: {error}.\n  fix: copy it again, or write it anew"
+        ) from error
 
 
 def read_image(path: str | Path) -> np.ndarray:
@@ -53,7 +65,13 @@ def read_image(path: str | Path) -> np.ndarray:
     data = _read_bytes(path)
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < len(data) // 2:
         raise DataError(f"{path}: the JPEG is cut off, it has no end marker in its {len(data)} bytes; copy it again")
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error as error:
+        raise DataError(
+            f"{path}: cannot be decoded as a picture ({len(data)} bytes); does its header claim too many pixels?\n"
+            f"  OpenCV: {error.err}\n  fix: copy it again"
+        ) from error
     if picture is None:
         raise DataError(
             f"{path}: cannot be decoded as a picture ({len(data)} bytes); it is cut off or of no known format"
@@ -79,20 +97,29 @@ def _checked(path: Path, scan: Scan, repair: bool) -> Scan:
     """The scan, or DataError if points are unusable and not to be repaired."""
     if not len(scan.xyz):
         raise DataError(f"{path}: the scan has no points")
-    with np.errstate(invalid="ignore"):
-        near = (np.abs(scan.xyz) < FARTHEST).all(1)  # False for NaN
-    good = near & np.isfinite(scan.features).all(1)
+    good = _usable(scan)
     if not good.all():
         if not repair:
-            raise DataError(_describe_bad(path, scan, near))
+            raise DataError(_describe_bad(path, scan))
         scan = Scan(scan.xyz[good], scan.features[good], scan.names)
     if not scan.xyz.any():
         raise DataError(f"{path}: no point is usable: all {len(good)} are at the origin, not finite or beyond 100 km")
     return scan
 
 
-def _describe_bad(path: Path, scan: Scan, near: np.ndarray) -> str:
-    finite = np.isfinite(scan.xyz).all(1)
+def _near(scan: Scan) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        near: np.ndarray = (np.abs(scan.xyz) < FARTHEST).all(1)  # False for NaN
+    return near
+
+
+def _usable(scan: Scan) -> np.ndarray:
+    usable: np.ndarray = _near(scan) & np.isfinite(scan.features).all(1)
+    return usable
+
+
+def _describe_bad(path: Path, scan: Scan) -> str:
+    near, finite = _near(scan), np.isfinite(scan.xyz).all(1)
     counts = {
         "x, y, z not finite": (~finite).sum(),
         "x, y, z beyond 100 km": (finite & ~near).sum(),

@@ -18,10 +18,14 @@ def settle_norms(model: PerceptionModel, batches: Iterable[Batch]) -> None:
 
     During training they average over past batches, and so over past weights, with dropout; in a short training with
     small batches the network then differs much in evaluation. Wu and Johnson, "Rethinking Batch in BatchNorm", 2021,
-    section 3 (PreciseBN). Every batch counts the same; gradients and weights are left alone.
+    section 3 (PreciseBN). Every batch counts the same; gradients and weights are left alone, and so is what is frozen.
     """
     found: dict[_BatchNorm, list[tuple[Tensor, Tensor]]] = {
-        module: [] for module in model.modules() if isinstance(module, _BatchNorm) and module.track_running_stats
+        module: []
+        for module in model.modules()
+        if isinstance(module, _BatchNorm)
+        and module.track_running_stats
+        and all(weight.requires_grad for weight in module.parameters())
     }
     handles = [norm.register_forward_pre_hook(_recorder(rows)) for norm, rows in found.items()]
     kept = {norm: {name: value.clone() for name, value in norm.named_buffers()} for norm in found}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,14 +17,16 @@ import torch
 from lidarfw import draw, kitti
 from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.components.datasets.drives import read_table
+from lidarfw.data import evaluation_data
 from lidarfw.errors import ConfigError, DataError
-from lidarfw.files import atomic_path, write_text
+from lidarfw.files import atomic_path, natural, write_text
 from lidarfw.io import IMAGE_SUFFIXES, SCAN_READERS, read_image, read_points
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import transform
 from lidarfw.types import (
     Boxes,
     Camera,
+    DataSpec,
     Frame,
     FrameMeta,
     FrameResult,
@@ -89,7 +92,7 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     files = [file for file in path.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
     if not files:
         raise DataError(f"{path}: no file in this folder ends in {', '.join(suffixes)}")
-    return sorted(files, key=lambda file: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", file.name)])
+    return sorted(files, key=lambda file: natural(file.name))
 
 
 def _source(file: Path, calibration: Path | None, image: Path | None, lidar: bool) -> Source:
@@ -113,15 +116,20 @@ class FrameReader:
     ) -> None:
         """Options are those of `lidarfw.io.read_points`; intensities are divided by `intensity_max`."""
         self.data = model.plan.data
+        if not 0 < intensity_max < math.inf:
+            raise ConfigError(f"the full scale of intensity must be above 0, got {intensity_max:g}")
+        if columns is not None and columns < 3:
+            raise ConfigError(f"a scan has at least 3 columns (x, y, z), got {columns}")
         self.columns, self.repair, self.intensity_max = columns, repair, intensity_max
         self.transforms = make_transforms(model.plan.config, training=False)
         self.needed = needed_inputs(model)
+        self.given = _given(model, self.needed)  # inputs of the dataset, before the transforms
         self.left_out: tuple[str, ...] = ()  # features of the last scan that the model does not know
 
     @property
     def lidar(self) -> bool:
         """Whether the model needs scans, and not pictures alone."""
-        return any(self.data.inputs[name].kind is not Image for name in self.needed)
+        return self.given is not self.data or any(self.data.inputs[name].kind is not Image for name in self.needed)
 
     def read(self, source: Source, sequence: str = "", index: int = 0) -> Frame:
         """The frame of one source. DataError where a file is broken or is not what the model needs."""
@@ -130,10 +138,10 @@ class FrameReader:
         path, images = str(source.path), {kitti.IMAGE: str(source.image)} if source.image else {}
         meta = FrameMeta(source.id, sequence or source.id, index, index * PERIOD, cameras, path, images)
         inputs: dict[str, Any] = {}
-        for name, spec in self.data.inputs.items():
+        for name, spec in self.given.inputs.items():
             if spec.kind is Points and self.lidar:
                 inputs[name] = self._points(source, spec)
-            elif spec.kind is Image and (picture is not None or name in self.needed):
+            elif self.given is self.data and spec.kind is Image and (picture is not None or name in self.needed):
                 inputs[name] = _image(source, spec, picture, cameras)
         frame = Frame(inputs, Targets(), meta)
         for change in self.transforms:
@@ -163,6 +171,19 @@ class FrameReader:
             raise DataError(f"{source.path}: the model also needs {kinds}, which files alone do not give")
 
 
+def _given(model: PerceptionModel, needed: set[str]) -> DataSpec:
+    """The data spec that files are read for: after the transforms, which usually add inputs to those of the dataset.
+
+    The dataset's own where transforms make what is needed of scans that they do not keep, such as panoramas.
+    """
+    data, config = model.plan.data, model.plan.config
+    if any(spec.kind is Points for spec in data.inputs.values()) or not config.get("transform"):
+        return data
+    before = make_dataset(config, config.get("splits", {}).get("train", "train")).spec
+    scans = any(spec.kind is Points for spec in before.inputs.values())
+    return before if scans and not needed <= set(before.inputs) else data
+
+
 def needed_inputs(model: PerceptionModel) -> set[str]:
     """Names of the data inputs that the parts of the model read at inference."""
     slots = ("backbone", "neck", "head", "postprocessor", "filter", "tracker", "retriever")
@@ -179,7 +200,7 @@ def needed_inputs(model: PerceptionModel) -> set[str]:
 
 def _check_intensity(path: Path, values: torch.Tensor) -> None:
     low, high = float(values.min()), float(values.max())
-    if low < 0 or high > 1:
+    if not (low >= 0 and high <= 1):  # of NaN neither is true
         guess = 255 if high <= 255 else 65535
         raise DataError(
             f"{path}: intensity is {low:g}..{high:g}, models learn from 0..1.\n"
@@ -197,7 +218,10 @@ def _cameras(source: Source, picture: draw.Picture | None) -> dict[str, Camera]:
 def _image(source: Source, spec: Spec, picture: draw.Picture | None, cameras: dict[str, Camera]) -> Image:
     """The picture as an input, at the size that the model learned from: smaller ones get a black border."""
     if picture is None:
-        raise DataError(f"{source.path}: the model needs a picture of the camera too\n  fix: --image FILE")
+        raise DataError(
+            f"{source.path}: the model needs a picture of the camera too\n"
+            "  fix: image_2/NAME.png beside velodyne/NAME.bin, or lidarfw predict --image FILE"
+        )
     height, width = picture.shape[:2]
     learned = spec.geometry if isinstance(spec.geometry, Camera) else None
     size = (learned.width, learned.height) if learned else (width, height)
@@ -222,9 +246,7 @@ class SplitFrames(Sequence[Frame]):
         config = model.plan.config
         if not config.get("dataset"):
             raise ConfigError("the checkpoint names no dataset, so it has no splits\n  fix: give scans instead")
-        self.dataset = make_dataset(config, config.get("splits", {}).get(split, split))
-        self.dataset.prepare()
-        self.transforms = make_transforms(config, training=False)
+        self.dataset, self.transforms = evaluation_data(config, config.get("splits", {}).get(split, split))
 
     def __len__(self) -> int:
         return len(self.dataset)

@@ -26,6 +26,7 @@ from lidarfw import checkpoint, config
 from lidarfw.assembly import make_dataset, make_transforms, plan
 from lidarfw.components.datasets.folder import FolderDataset
 from lidarfw.components.per_class import per_class
+from lidarfw.data import make_ready
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.files import write_text
 from lidarfw.model import PerceptionModel
@@ -235,6 +236,7 @@ class Loop:
     def _frames(self, model: PerceptionModel, chosen: set[Path]) -> Iterator[Frame]:
         """The frames of these scans as the model takes them."""
         dataset, transforms = self._dataset("train", boxes=False), make_transforms(model.plan.config, training=False)
+        make_ready(dataset, transforms)
         for index in range(len(dataset)):
             if Path(dataset.meta(index).path) in chosen:
                 frame = dataset[index].replace(targets=Targets())

@@ -6,7 +6,9 @@ import difflib
 import functools
 import importlib
 import importlib.metadata
+import inspect
 import json
+import logging
 import sys
 import traceback
 from collections.abc import Iterator
@@ -23,6 +25,8 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,18 @@ def use(**slots: dict[str, Any]) -> Iterator[None]:
         _in_use.remove(slots)
 
 
+def packages() -> set[str]:
+    """Top-level packages of all declared components."""
+    return {entry.value.partition(":")[0].partition(".")[0] for slot in SLOTS for entry in entries(slot)} - {"__main__"}
+
+
+def trusted(name: str) -> bool:
+    """Whether a stranger may choose this component: it is named, or its class is of a package that declares some."""
+    module, colon, _ = name.partition(":")
+    parts = module.split(".")
+    return not colon or (parts[0] in packages() and "__main__" not in parts)
+
+
 def find(slot: str, name: str) -> Entry:
     """The entry of a component: a registered name, or "package.module:Class" for a class that is not packaged."""
     if ":" in name:
@@ -118,13 +134,16 @@ def load(slot: str, name: str) -> Any:
     entry = find(slot, name)
     module, _, attribute = entry.value.partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        found = getattr(importlib.import_module(module), attribute)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a broken plugin may even call sys.exit while it is imported
         origin = f" ({entry.origin})" if entry.origin else ""
         reason = f"{error or type(error).__name__}, at {_where(error)}"
         raise RegistryError(f"component could not be imported: {slot} {name!r}{origin}: {reason}") from error
+    if not inspect.isclass(found):
+        raise RegistryError(f"{slot} {name!r} is no class: {entry.value} is a {type(found).__name__}")
+    return found
 
 
 def _where(error: BaseException) -> str:
@@ -140,7 +159,12 @@ def _short(filename: str) -> str:
 
 def _unknown(slot: str, name: str) -> str:
     for distribution, project in editable_projects().items():
-        if name in declared_by(project).get(slot, {}):
+        try:
+            declared = declared_by(project)
+        except RegistryError as error:  # of one plugin: the others are to work
+            log.warning("%s: %s", distribution, error)
+            continue
+        if name in declared.get(slot, {}):
             return (
                 f"{slot} {name!r} is declared in {project / 'pyproject.toml'} but not in the installed metadata of "
                 f"{distribution}.\n  fix: pip install -e {project}"
@@ -169,25 +193,34 @@ def editable_projects() -> dict[str, Path]:
 
 
 def declared_by(project: Path) -> dict[str, dict[str, str]]:
-    """Components that a project's pyproject.toml declares: slot -> name -> value."""
-    file = project / "pyproject.toml"
-    if not file.is_file():
-        return {}
-    points = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {}).get("entry-points", {})
+    """Components that a project's pyproject.toml declares: slot -> name -> value. RegistryError if it is no TOML."""
+    points = _project_table(project).get("entry-points", {})
     return {group.removeprefix("lidarfw."): value for group, value in points.items() if group.startswith("lidarfw.")}
 
 
 def project_name(project: Path) -> str:
     """Name of the distribution that a project's pyproject.toml builds."""
-    text = (project / "pyproject.toml").read_text(encoding="utf-8")
-    return str(tomllib.loads(text).get("project", {}).get("name", ""))
+    return str(_project_table(project).get("name", ""))
+
+
+def _project_table(project: Path) -> dict[str, Any]:
+    file = project / "pyproject.toml"
+    try:
+        text = file.read_text(encoding="utf-8") if file.is_file() else ""
+        return dict(tomllib.loads(text).get("project", {}))
+    except ValueError as error:  # no TOML, or no text
+        raise RegistryError(f"{file} is no TOML: {error}.\n  fix: correct that line") from error
 
 
 def stale_metadata() -> list[str]:
     """One message for every editable distribution whose pyproject and installed metadata differ."""
     messages = []
     for distribution, project in editable_projects().items():
-        here = {(slot, n) for slot, points in declared_by(project).items() for n in points}
+        try:
+            here = {(slot, n) for slot, points in declared_by(project).items() for n in points}
+        except RegistryError as error:
+            messages.append(f"{distribution}: {error}")
+            continue
         there = {
             (slot, e.name) for slot, group in _installed().items() for e in group if e.distribution == distribution
         }

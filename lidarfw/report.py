@@ -16,8 +16,8 @@ import torch
 import yaml
 
 from lidarfw import draw
-from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.checkpoint import load
+from lidarfw.data import evaluation_data
 from lidarfw.errors import DataError
 from lidarfw.files import write_text
 from lidarfw.predict import extent_of, keep_scores, pictures_of
@@ -169,9 +169,7 @@ def _frames(model: PerceptionModel, split: str, count: int, score: float) -> str
 @torch.no_grad()
 def _results(model: PerceptionModel, split: str, count: int) -> Iterator[FrameResult]:
     """Results of frames evenly spaced over a split, with their truth."""
-    dataset = make_dataset(model.plan.config, split)
-    transforms = make_transforms(model.plan.config, training=False)
-    dataset.prepare()
+    dataset, transforms = evaluation_data(model.plan.config, split)
     for index in sorted({round(i * (len(dataset) - 1) / max(count - 1, 1)) for i in range(count)}):
         frame = dataset[index]
         for transform in transforms:

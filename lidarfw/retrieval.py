@@ -24,12 +24,17 @@ class Index(Record):
     """One descriptor and pose for each of the N places of a map."""
 
     vector: Tensor  # (N, D) float32
-    pose: Tensor  # (N, 4, 4) sensor to map
+    pose: Tensor  # (N, 4, 4) sensor to map; zeros where not known
     time: Tensor  # (N,) seconds; NaN where not known
     modality: tuple[str, ...] = ()  # "lidar" or "camera" of each place, or empty
 
     def __len__(self) -> int:
         return int(self.vector.shape[0])
+
+    @property
+    def known(self) -> Tensor:
+        """(N,) bool: which places have a pose."""
+        return self.pose[:, 3, 3] == 1
 
     def save(self, path: str | Path) -> None:
         """Write an .npz file of plain arrays, atomically. DataError where the file system refuses."""
@@ -74,13 +79,15 @@ def recall_at(
 ) -> dict[str, float]:
     """Share of queries with a place within `radius` metres among their N best matches: `{"recall@1": 0.9, ...}`.
 
-    Only queries that have such a place in the map, and whose pose is ok, are counted; 0 where there are none.
+    Only queries that have such a place in the map, and whose pose is ok, are counted; 0 where there are none. A place
+    whose pose is not known is near nothing.
     """
     places, here = index.pose[:, :3, 3].double(), queries.matrix[:, :3, 3].double()
-    blocks = [_nearest(here[i : i + 1024], places) for i in range(0, max(len(here), 1), 1024)]
+    blocks = [_nearest(here[i : i + 1024], places[index.known]) for i in range(0, max(len(here), 1), 1024)]
     solvable = queries.ok & (torch.cat(blocks) <= radius)
     found = places[matches.index.clamp(min=0)] if len(index) else here[:, None].expand(*matches.index.shape, 3)
-    right = ((found - here[:, None]).norm(dim=2) <= radius) & (matches.index >= 0)
+    known = (matches.index >= 0) & (index.known[matches.index.clamp(min=0)] if len(index) else False)
+    right = ((found - here[:, None]).norm(dim=2) <= radius) & known
     total = max(int(solvable.sum()), 1)
     return {f"recall@{count}": float((right[:, :count].any(1) & solvable).sum() / total) for count in counts}
 

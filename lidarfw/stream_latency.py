@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from lidarfw.assembly import make_transforms, transform_names
+from lidarfw.assembly import named_transforms
 from lidarfw.components.datasets.drives import Drive, merge_scans, pose_of
 from lidarfw.latency import clocks, memory, now
 from lidarfw.model import PerceptionModel
@@ -126,8 +126,7 @@ def measure_stream(
 
 def _timed_frames(model: PerceptionModel, frames: Iterator[Frame], times: dict[str, list[float]]) -> Iterator[Frame]:
     """The frames after the model's transforms; how long each step takes goes to `times`."""
-    config = model.plan.config
-    transforms = dict(zip(transform_names(config, False), make_transforms(config, False), strict=True))
+    transforms = named_transforms(model.plan.config, training=False)
     while True:
         begin = now()
         frame = next(frames)

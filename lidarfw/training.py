@@ -199,11 +199,25 @@ class PerceptionModule(pl.LightningModule):
     def _log_metrics(self, stage: str) -> None:
         if self._stream is not None and not self._idle:
             self._count(self._stream.flush())
-        figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
+        try:
+            figures = {f"{stage}/{name}": value for name, value in self.model.compute_metrics().items()}
+        except ConfigError as error:
+            if not self._partial(stage):
+                raise
+            _say(f"no figures of a part of the {stage} data: {error}")
+            return
         for name, value in figures.items():
             self.log(name, value, prog_bar=name == self.monitor, sync_dist=True)
         if not self.trainer.sanity_checking:
             self.figures = figures
+
+    def _partial(self, stage: str) -> bool:
+        """Whether only some batches were evaluated: they need not hold all that a metric compares, such as a map."""
+        if self.trainer.sanity_checking:
+            return True
+        test = stage == "test"
+        loader = self.trainer.test_dataloaders if test else self.trainer.val_dataloaders
+        return sum(self.trainer.num_test_batches if test else self.trainer.num_val_batches) < len(loader or ())
 
     test_step = validation_step
     on_test_epoch_start = on_validation_epoch_start
@@ -260,7 +274,10 @@ def check_resumable(content: Mapping[str, Any], module: PerceptionModule) -> Non
     there, here = (spec["data_spec"]["classes"] for spec in (about, module.about))
     if there == here and not (report.missing or report.skipped or report.mismatched):
         return
-    stored, own = (checkpoint.config_of(spec, "the checkpoint to resume from") for spec in (about, module.about))
+    stored, own = (
+        checkpoint.config_of(spec, "the checkpoint to resume from", allow_unregistered=True)  # only to be compared
+        for spec in (about, module.about)
+    )
     changes = [line for line in differences(stored, own) if line.startswith((*MODEL_KEYS, "dataset"))]
     raise CheckpointError(
         "cannot resume: the checkpoint is of another model.\n"
@@ -327,7 +344,7 @@ def train(config: DictConfig) -> dict[str, float]:
         wired = plan(config)
         for warning in wired.warnings:
             rank_zero_warn(warning)
-        pl.seed_everything(config.seed, verbose=False)
+        _seed_everything(config.seed)
         model = build(wired)
         _initialise(model, config.init)
         module = _module(model, to_plain(config), checkpoint.describe(wired))
@@ -343,6 +360,12 @@ def _quieten() -> None:
     logging.getLogger("lightning.pytorch.utilities.rank_zero").setLevel(logging.WARNING)
     for text in (".*LeafSpec.*", ".*does not have many workers.*", ".*smaller than the logging interval.*"):
         warnings.filterwarnings("ignore", message=text)
+
+
+def _seed_everything(seed: Any) -> None:
+    if not isinstance(seed, int) or not 0 <= seed < 2**32:
+        raise ConfigError(f"seed must be a whole number from 0 to 2**32 - 1, found {seed!r}")
+    pl.seed_everything(seed, verbose=False)
 
 
 def _module(model: PerceptionModel, config: Mapping[str, Any], about: Mapping[str, Any]) -> PerceptionModule:
@@ -448,23 +471,30 @@ def _logger(node: dict[str, Any], folder: Path) -> Any:
 # --- evaluation -----------------------------------------------------------------------------------------------------
 
 
-def evaluate(path: str | Path, overrides: Sequence[str] = (), record: FrameRecord | None = None) -> dict[str, float]:
+def evaluate(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    record: FrameRecord | None = None,
+    *,
+    allow_unregistered: bool = False,
+) -> dict[str, float]:
     """Figures ("metric/key") of a checkpoint on the test split of its config.
 
     The model comes from the checkpoint; dataset, transforms, metric, loader, splits and trainer from its config too,
     changed by `overrides` (`dataset=kitti`, `dataset.kitti.root=/data`, `splits.test=val`, `trainer=gpu`). `record`
-    is filled with what every frame adds to the metrics; it needs an evaluation in one process. Raises ConfigError for
-    an override of what was learned, CheckpointError where the data is not what the model learned.
+    is filled with what every frame adds to the metrics; it needs an evaluation in one process. `allow_unregistered` is
+    that of `lidarfw.load`. Raises ConfigError for an override of what was learned, CheckpointError where the data is
+    not what the model learned.
     """
     from lidarfw.assembly import build, plan
 
     _quieten()
     content = checkpoint.read(path)
     about = checkpoint.description(content, path)
-    config = evaluation_config(checkpoint.config_of(about, path), overrides)
-    wired = plan(config)
+    config = evaluation_config(checkpoint.config_of(about, path, allow_unregistered=allow_unregistered), overrides)
+    wired = plan(checkpoint.without_start(to_plain(config)))
     _check_same_data(DataSpec.from_plain(about["data_spec"]), wired.data, path)
-    pl.seed_everything(config.seed, verbose=False)
+    _seed_everything(config.seed)
     model = build(wired)
     checkpoint.restore(model, content, path)
     module = _module(model, to_plain(config), about)

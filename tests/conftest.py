@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from lidarfw import registry
+from lidarfw.interfaces import Dataset, Transform
+from lidarfw.types import Frame
 
 collect_ignore = ["fixtures"]  # other people's projects: their tests run where they are installed
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,3 +46,28 @@ def real_data(real_data_root: Path | None) -> Callable[[str], Path]:
         return path
 
     return find
+
+
+class Told(Transform):
+    """Changes nothing, but refuses frames unless it was prepared for their dataset, and then attached to it."""
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def prepare(self, dataset: Dataset, workers: int = 1) -> None:
+        self.calls.append(dataset)
+
+    def attach(self, dataset: Dataset) -> None:
+        self.calls.append(dataset)
+
+    def __call__(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        assert len(self.calls) == 2
+        assert self.calls[0] is self.calls[1]
+        return frame
+
+
+@pytest.fixture
+def told() -> Iterator[list[str]]:
+    """Overrides that add the transform `Told`."""
+    with registry.use(transform={"told": Told}):
+        yield ["+transform.told.type=told"]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -246,12 +248,16 @@ def _broken_files() -> dict[str, tuple[str, bytes, str]]:
         "pcd type": ("a.pcd", good.replace(b"TYPE F F F F", b"TYPE F F F Q"), "TYPE Q"),
         "pcd count": ("a.pcd", good.replace(b"POINTS 100", b"POINTS -1"), "whole number"),
         "pcd no z": ("a.pcd", good.replace(b"x y z", b"x y w"), "no field z"),
+        "pcd twice": ("a.pcd", good.replace(b"x y z intensity", b"x y z z"), "not a readable .pcd file: field 'z'"),
+        "pcd negative": ("a.pcd", good.replace(b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1"), "not a readable .pcd file"),
+        "pcd too many": ("a.pcd", pcd(POINTS, "ascii", b"1 2 3 4").replace(b"S 100", b"S 1" + b"0" * 25), "too large"),
         "pcd no points": ("a.pcd", pcd(POINTS[:0], "binary", b""), "no points"),
         "not ply": ("a.ply", b"plx", "no PLY header"),
         "ply format": ("a.ply", ply.replace(b"ascii", b"cuneiform"), "cuneiform"),
         "ply type": ("a.ply", ply.replace(b"float z", b"quad z"), "quad"),
         "ply text": ("a.ply", ply.replace(b"0.", b"zero.", 1), "not a number"),
         "ply no vertex": ("a.ply", ply.replace(b"vertex", b"corner"), "no element `vertex`"),
+        "ply too many": ("a.ply", ply.replace(b"vertex 100", b"vertex 1" + b"0" * 25), "not a readable .ply file"),
         "ply list": ("a.ply", ply.replace(b"property float x", b"property list uchar float x"), "list"),
         "npy": ("a.npy", b"\x93NUMPY nothing", "not a readable .npy"),
         "npz": ("a.npz", b"PK\x03\x04 nothing", "not a readable .npz"),
@@ -272,11 +278,13 @@ def test_numpy_files_with_objects_or_wrong_shapes_are_refused(tmp_path: Path) ->
     np.save(tmp_path / "object.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     np.save(tmp_path / "flat.npy", np.zeros(30))
     np.save(tmp_path / "text.npy", np.array([["a", "b", "c"]]))
+    np.save(tmp_path / "words.npy", np.array([("a", "b", "c")], [("x", "U1"), ("y", "U1"), ("z", "U1")]))
     np.savez(tmp_path / "two.npz", first=np.zeros((5, 3)), second=np.zeros((5, 3)))
     for name, message in {
         "object.npy": "not a readable",
         "flat.npy": r"shape \(30,\)",
         "text.npy": "expected numbers",
+        "words.npy": "not a readable .npy file: could not convert string to float",
         "two.npz": "expected an array `points`",
     }.items():
         with pytest.raises(DataError, match=message):
@@ -313,6 +321,20 @@ def test_pictures(tmp_path: Path) -> None:
                 read_image(tmp_path / name)
     cv2.imwrite(str(tmp_path / "grey.png"), picture[..., 0])
     assert read_image(tmp_path / "grey.png").shape == (20, 30, 3)
+
+
+def test_pictures_that_claim_too_many_pixels(tmp_path: Path) -> None:
+    png, tiff = (bytes(cv2.imencode(suffix, np.zeros((4, 4, 3), np.uint8))[1]) for suffix in (".png", ".tiff"))
+    head = b"IHDR" + struct.pack(">II", 100_000, 100_000) + png[24:29]
+    width = struct.pack("<HHI", 256, 4, 1)  # the tag, as uint32, of one value
+    files = {
+        "a.png": png[:12] + head + struct.pack(">I", zlib.crc32(head)) + png[33:],
+        "a.tiff": tiff.replace(struct.pack("<HHII", 256, 3, 1, 4), width + struct.pack("<I", 2**20 + 1)),
+    }
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=f"{name}: cannot be decoded .* too many pixels"):
+            read_image(tmp_path / name)
 
 
 def test_real_scans(real_data: Callable[[str], Path]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from lidarfw.assembly import build, plan
 from lidarfw.checkpoint import describe
 from lidarfw.cli import main
 from lidarfw.config import compose
-from lidarfw.errors import DataError
+from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Filter
 from lidarfw.predict import FrameReader, find_sources, keep_scores, predict, to_plain
 from lidarfw.testing.synthetic import SyntheticDataset
@@ -219,6 +220,12 @@ def test_mistakes_are_explained(
         ([scans / "8.bin", tmp_path / "other" / "8.bin"], "would both write 8.*"),
         ([scans, "--image", "x.png"], "--image is the picture of one scan, and there are 3"),
         ([scans / "9.bin", "--format", "kitti"], "need the camera"),
+        ([scans / "9.bin", "--intensity-max", "0"], "--intensity-max must be above 0, got 0"),
+        ([scans / "9.bin", "--intensity-max", "nan"], "--intensity-max must be above 0, got nan"),
+        ([scans / "9.bin", "--score", "nan"], "--score must be a finite number"),
+        ([scans / "9.bin", "--columns", "2"], "--columns must be at least 3"),
+        ([scans / "9.bin", "--static-map", "st.ply"], "--static-map does nothing for scans"),
+        (["--split", "val", "--repair"], "--repair does nothing for a split"),
     ]
     for arguments, message in cases:
         assert cli(checkpoint, *arguments, "-o", tmp_path / "out") == 2, arguments
@@ -234,6 +241,9 @@ def test_intensity_can_be_scaled_and_broken_points_dropped(checkpoint: Path, sca
     np.save(tmp_path / "loud.npy", broken)
     model = lidarfw.load(checkpoint)
     plain = next(predict(model, FrameReader(model), find_sources([scans / "8.bin"], True)))
+    for strange in ({"intensity_max": 0.0}, {"intensity_max": math.nan}, {"columns": 2}):
+        with pytest.raises(ConfigError):
+            FrameReader(model, **strange)  # type: ignore[arg-type]
     reader = FrameReader(model, repair=True, intensity_max=255)
     scaled = next(predict(model, reader, find_sources([tmp_path / "loud.npy"], True)))
     torch.testing.assert_close(scaled.of(Boxes).tensor, plain.of(Boxes).tensor, atol=1e-3, rtol=1e-3)
@@ -282,3 +292,9 @@ def test_real_scan_with_its_picture(checkpoint: Path, real_data: Callable[[str],
 def test_missing_calibration_of_a_picture(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no file in this folder"):
         find_sources([tmp_path], lidar=False)
+
+
+def test_transforms_of_a_split_know_its_dataset(tmp_path: Path, told: list[str]) -> None:
+    path = write_checkpoint(tmp_path / "told.ckpt", *SMALL, "dataset.synthetic.frames=2", *told)
+    assert cli(path, "--split", "val", "-o", tmp_path / "out") == 0
+    assert len(list((tmp_path / "out").glob("*.json"))) == 2

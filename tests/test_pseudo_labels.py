@@ -176,3 +176,10 @@ def test_other_settings_in_the_same_folder_are_refused(scans: Path, tmp_path: Pa
     (tmp_path / "round_1" / "data").mkdir(parents=True)
     with pytest.raises(pseudo_labels.ConfigError, match=r"middling: 0.3 there, 0.2 here"):
         Loop(tmp_path, Settings(tuple(overrides(scans)), middling=0.2))
+
+
+def test_transforms_know_the_dataset_of_the_scans_that_are_labelled(
+    scans: Path, tmp_path: Path, told: list[str]
+) -> None:
+    command = [*overrides(scans), *told, "postprocessor=nms", "postprocessor.nms.score_threshold=0", *ALL]
+    assert main(["pseudo-label", str(tmp_path / "out"), *command, "--rounds", "1"]) == 0

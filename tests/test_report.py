@@ -111,3 +111,11 @@ def test_eval_prints_and_writes_the_figures(run: Path, tmp_path: Path, capsys: p
     assert f"{figures['box_ap/mean_3d_ap']:.4f}" in printed
     assert main(["eval", checkpoint, "backbone=second"]) == 2
     assert "model" in capsys.readouterr().err
+
+
+def test_transforms_know_the_dataset_of_the_pictures(tmp_path: Path, told: list[str]) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    wired = plan(compose([*SMALL, *told]))
+    weights = {f"model.{name}": value for name, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "checkpoints" / "last.ckpt")
+    assert "<figure>" in write_report(tmp_path, frames=1).read_text()

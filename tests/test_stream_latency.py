@@ -57,6 +57,15 @@ def test_every_part_is_measured(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert 0 < found["memory"][0] <= found["memory"][1]
 
 
+def test_what_is_for_training_only_is_left_out() -> None:
+    """Also where the options say so: `crop` of boxes is for training."""
+    found = measure_stream(
+        build(plan(compose([*SMALL, "transform.crop.boxes=true", "transform=[crop,random_flip]"]))), 1
+    )
+    assert "backbone.pillars" in found.parts
+    assert not any(name.startswith("transform") for name in found.parts)
+
+
 def test_half_precision_runs() -> None:
     found = measure_stream(build(plan(compose(SMALL))), 2, "bf16")
     assert found.precision == "bf16"

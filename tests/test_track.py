@@ -135,6 +135,50 @@ def test_what_predict_wrote_can_be_tracked(tmp_path: Path) -> None:
     assert [[row["id"] for row in rows] for rows in found] == [[1]] * 4
 
 
+def write_detections(folder: Path, count: int, **changes: object) -> None:
+    """Files 1.json, 2.json, ... with a car that drives along; `changes` are of the box of the last."""
+    folder.mkdir()
+    for t in range(1, count + 1):
+        row: dict[str, object] = {"class": "car", "score": 0.9, "center": [10 + t, 2, 0], "size": [4, 2, 1.5], "yaw": 0}
+        row |= changes if t == count else {}
+        plain = {"classes": ["car"], "predictions": {"head.center": {"kind": "Boxes", "boxes": [row]}}}
+        (folder / f"{t}.json").write_text(json.dumps(plain))
+
+
+def test_files_are_taken_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    write_detections(tmp_path / "scans", 12)
+    assert cli.main(["track", str(tmp_path / "scans"), "--format", "json", "-o", str(tmp_path / "out")]) == 0
+    found = [json.loads((tmp_path / f"out/{t}.json").read_text())["tracks"] for t in range(1, 13)]
+    assert [[row["id"] for row in rows] for rows in found] == [[1]] * 12
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [({"yaw": float("nan")}, "expected finite numbers"), ({"size": [4, -2, 1.5]}, "size must be above 0"),
+     ({"center": [1, 2]}, "2.json: expected boxes with"), ({"velocity": [1]}, "2.json"), ({"class": "bus"}, "'bus'")],
+)  # fmt: skip
+def test_broken_boxes_are_refused(
+    changes: dict[str, object], text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_detections(tmp_path / "scans", 2, **changes)
+    assert cli.main(["track", str(tmp_path / "scans"), "--format", "json", "-o", str(tmp_path / "out")]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_what_no_format_reads_is_refused(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_detections(tmp_path / "scans", 1)
+    for option in ("--sequences", "--calib", "--poses", "--root"):
+        assert cli.main(["track", str(tmp_path / "scans"), "--format", "json", option, str(drive)]) == 2
+        assert f"{option} is for --format" in capsys.readouterr().err
+    (tmp_path / "scans/1.json").write_text('{"classes": ["car"], "predictions": [1]}')
+    assert cli.main(["track", str(tmp_path / "scans"), "--format", "json"]) == 2
+    assert "1.json: expected boxes with" in capsys.readouterr().err
+    assert cli.main(["track", str(tmp_path / "scans/1.json"), "--calib", str(drive)]) == 2
+    assert "1.json is a file" in capsys.readouterr().err
+    assert cli.main(["track", str(tmp_path / "scans"), "--format", "nuscenes", "--root", str(drive)]) == 2
+    assert "scans is a folder" in capsys.readouterr().err
+
+
 def test_nuscenes_submission(tmp_path: Path) -> None:
     tables = tmp_path / "v1.0-mini"
     tables.mkdir()

@@ -285,13 +285,21 @@ class Runner:
                 continue
             self._active.remove(active)
             active.job.spend(active.what, time.monotonic() - active.began)
-            if code == 0 and active.what == "train":
-                _note_trained(active.job)
-            if code == 0:
+            if self._ended_well(active.job, active.what, active.job.folder / _LOG, code):
                 self._next(active.job, active.lock)
             else:
                 active.lock.close()
-                self.failed[active.job.folder] = _last_words(active.job.folder / _LOG, code)
+
+    def _ended_well(self, job: Job, what: str, log: Path, code: int) -> bool:
+        """Note a training that is done, or why the job failed."""
+        try:
+            if code == 0 and what == "train":
+                _note_trained(job)
+        except DataError as error:
+            self.failed[job.folder] = str(error)
+        if code != 0:
+            self.failed[job.folder] = _last_words(log, code)
+        return job.folder not in self.failed
 
     def _stop(self) -> None:
         """End all processes; training saves where it stands."""
@@ -336,10 +344,7 @@ class Runner:
         active.lock.close()
         for job in jobs:
             job.spend("train", (time.monotonic() - active.began) / len(jobs))
-            if code == 0:
-                _note_trained(job)
-            else:
-                self.failed[job.folder] = _last_words(job.folder.parent / _LOG, code)
+            self._ended_well(job, "train", job.folder.parent / _LOG, code)
 
 
 def _commands(job: Job, stated: ClaimsFile) -> Iterator[tuple[str, list[str]]]:

@@ -94,7 +94,7 @@ def _match(index: Index, place: int, distance: float) -> dict[str, Any]:
     return {
         "place": place,
         "distance": distance,
-        "pose": index.pose[place].tolist(),
+        "pose": index.pose[place].tolist() if index.known[place] else None,
         "time": None if time != time else time,
         "modality": index.modality[place] if index.modality else None,
     }
@@ -109,14 +109,13 @@ def _eval(args: argparse.Namespace) -> int:
 
     retriever = make_retriever(args.retriever, args.option)
     index, queries = _load(retriever, args.map), Index.load(args.queries)
-    known = queries.pose[:, 3, 3] == 1
-    if not bool(known.any()) or not bool((index.pose[:, 3, 3] == 1).any()):
+    if not bool(queries.known.any()) or not bool(index.known.any()):
         raise DataError(
             f"{args.map} or {args.queries} has no poses.\n  fix: build it with --poses FILE or --split NAME"
         )
     described = Descriptors(queries.vector, queries.modality)
     matches = retriever.query(index, described, max(args.counts))
-    poses = Poses(queries.pose, known, torch.ones(len(queries)))
+    poses = Poses(queries.pose, queries.known, torch.ones(len(queries)))
     figures = {
         f"{name}_{radius:g}m": value
         for radius in args.radius

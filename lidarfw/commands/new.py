@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import keyword
 import re
 from dataclasses import dataclass
 from importlib import resources
@@ -114,10 +115,15 @@ def create(names: Names, folder: Path) -> None:
     texts = {path: Template(_template(name)).substitute(values) for path, name in names.files.items()}
     texts[f"{names.package}/__init__.py"] = f'"""The {names.slot} `{names.component}` for lidarfw."""\n'
     texts[f"{names.package}/conf/__init__.py"] = '"""Presets and experiments."""\n'
-    for path, text in texts.items():
-        target = folder / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(text, encoding="utf-8")
+    try:
+        for path, text in texts.items():
+            target = folder / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"cannot write {folder}: {error.strerror or error}.\n  fix: another folder with -o"
+        ) from error
 
 
 def _template(name: str) -> str:
@@ -139,10 +145,10 @@ def _values(names: Names) -> dict[str, str]:
 
 
 def _check(names: Names, folder: Path) -> None:
-    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", names.distribution):
+    if not re.fullmatch(r"[a-z][a-z0-9]*(-[a-z0-9]+)*", names.distribution) or keyword.iskeyword(names.package):
         raise ConfigError(
             f"{names.distribution!r} is no name for a distribution.\n"
-            "  fix: small letters, digits and single hyphens, such as acme-lidar"
+            "  fix: small letters, digits and single hyphens, such as acme-lidar; no word of Python"
         )
     if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", names.component):
         raise ConfigError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
     from lidarfw.types import Frame, FrameResult
 
 T = TypeVar("T")
+_UNREAD = {  # options that need another source
+    "a sequence": ("split", "poses", "map", "calib", "image", "columns", "intensity_max"),
+    "a split": ("static_map", "calib", "image", "columns", "intensity_max", "repair"),
+    "scans": ("static_map",),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--stream", action="store_true", help="the scans are one sequence: track, filter over time")
     parser.add_argument("--columns", metavar="N", type=int, help="values per point of .bin files (4; .pcd.bin 5)")
-    parser.add_argument("--intensity-max", metavar="M", type=float, default=1.0, help="full scale of intensity (1)")
+    parser.add_argument("--intensity-max", metavar="M", type=float, help="full scale of intensity (1)")
     parser.add_argument("--repair", action="store_true", help="drop points that are not finite instead of stopping")
     parser.add_argument("--no-pictures", action="store_true", help="write results only")
 
@@ -54,9 +60,24 @@ def run(args: argparse.Namespace) -> int:
     require_checkpoint(args.checkpoint)
     from lidarfw.drive_prediction import is_sequence
 
-    if len(args.scans) == 1 and is_sequence(Path(args.scans[0])):
-        return _run_sequence(args)
-    return _run_scans(args)
+    sequence = len(args.scans) == 1 and is_sequence(Path(args.scans[0]))
+    _check(args, "a sequence" if sequence else "a split" if args.split else "scans")
+    return _run_sequence(args) if sequence else _run_scans(args)
+
+
+def _check(args: argparse.Namespace, source: str) -> None:
+    """ConfigError for an option that would do nothing, or has a value that cannot be meant."""
+    from lidarfw.errors import ConfigError
+
+    for option in _UNREAD[source]:
+        if getattr(args, option) is not None and getattr(args, option) is not False:
+            raise ConfigError(f"--{option.replace('_', '-')} does nothing for {source}.\n  fix: leave it out")
+    if not math.isfinite(args.score):
+        raise ConfigError(f"--score must be a finite number, got {args.score}")
+    if args.intensity_max is not None and not 0 < args.intensity_max < math.inf:
+        raise ConfigError(f"--intensity-max must be above 0, got {args.intensity_max:g}\n  fix: 1, 255 or 65535")
+    if args.columns is not None and args.columns < 3:
+        raise ConfigError(f"--columns must be at least 3 (x, y, z), got {args.columns}")
 
 
 def _run_scans(args: argparse.Namespace) -> int:
@@ -67,7 +88,9 @@ def _run_scans(args: argparse.Namespace) -> int:
     from lidarfw.io import read_points
 
     model = lidarfw.load(Path(args.checkpoint)).to("cuda" if torch.cuda.is_available() else "cpu")
-    reader = predict.FrameReader(model, args.columns, args.repair, args.intensity_max)
+    reader = predict.FrameReader(
+        model, args.columns, args.repair, 1.0 if args.intensity_max is None else args.intensity_max
+    )
     frames, count = _frames(args, model, reader)
     if model.plan.data.sweeps > 1 and not args.split:
         print(f"note: the model learned from {model.plan.data.sweeps} scans per frame, here each frame is one scan")
@@ -102,7 +125,7 @@ def _run_sequence(args: argparse.Namespace) -> int:
     from lidarfw.types import PointLabels
 
     model = lidarfw.load(Path(args.checkpoint)).to("cuda" if torch.cuda.is_available() else "cpu")
-    frames = drive_prediction.SequenceFrames(model, Path(args.scans[0]))
+    frames = drive_prediction.SequenceFrames(model, Path(args.scans[0]), args.repair)
     classes, folder = model.plan.data.classes, Path(args.output)
     strip = drive_prediction.Strip(len(frames), classes)
     still = drive_prediction.StaticMap(classes=classes) if args.static_map else None

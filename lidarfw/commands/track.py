@@ -23,6 +23,7 @@ _EXPECTED = {
     "nuscenes": "a detection submission, one JSON file",
     "json": "a folder of what lidarfw predict wrote",
 }
+_OPTIONS = {"kitti": ("calib", "poses", "sequences", "images"), "nuscenes": ("root",)}  # what no other format reads
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calib", metavar="DIR", type=Path, help="kitti: calibrations SEQUENCE.txt")
     parser.add_argument("--poses", metavar="DIR", type=Path, help="kitti: 3 x 4 poses of camera 0, SEQUENCE.txt")
     parser.add_argument("--root", metavar="DIR", type=Path, help="nuscenes: folder of the tables (ROOT/v1.0-trainval)")
-    parser.add_argument("--sequences", metavar="NAME", nargs="+", help="only these (all)")
+    parser.add_argument("--sequences", metavar="NAME", nargs="+", help="kitti: only these (all)")
     parser.add_argument("--config-dir", metavar="DIR", help="folder with configs of your own")
     parser.add_argument("--pictures", action="store_true", help="also write a page to look through each sequence")
     parser.add_argument("--images", metavar="DIR", type=Path, help="kitti: pictures SEQUENCE/000000.png for the pages")
@@ -69,8 +70,7 @@ def _read(args: argparse.Namespace) -> tuple[list[DetectedSequence], tuple[str, 
     from lidarfw import detections
     from lidarfw.errors import DataError
 
-    if not args.detections.exists():
-        raise DataError(f"there are no detections {args.detections}.\n  {args.format}: {_EXPECTED[args.format]}")
+    _check(args)
     if args.format == "json":
         sequence, classes = detections.read_json(args.detections)
         return [sequence], classes, {}
@@ -88,6 +88,23 @@ def _read(args: argparse.Namespace) -> tuple[list[DetectedSequence], tuple[str, 
     names = args.sequences or detections.kitti_sequences(args.detections)
     read = (detections.read_kitti(args.detections, name, classes, args.poses, args.calib) for name in names)
     return list(read), classes, {}
+
+
+def _check(args: argparse.Namespace) -> None:
+    from lidarfw.errors import ConfigError, DataError
+
+    expected = f"{args.format}: {_EXPECTED[args.format]}"
+    if not args.detections.exists():
+        raise DataError(f"there are no detections {args.detections}.\n  {expected}")
+    if args.detections.is_file() != (args.format == "nuscenes"):
+        kind = "file" if args.detections.is_file() else "folder"
+        raise DataError(f"{args.detections} is a {kind}.\n  {expected}\n  fix: give that, or another --format")
+    for form, options in _OPTIONS.items():
+        strange = [option for option in options if getattr(args, option) is not None]
+        if strange and form != args.format:
+            raise ConfigError(
+                f"--{strange[0]} is for --format {form}, not {args.format}.\n  fix: leave it out, or change --format"
+            )
 
 
 def _with_progress(sequences: list[DetectedSequence]) -> Any:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 from typing import Any
 
-from lidarfw.errors import LidarfwError
+from lidarfw.errors import ConfigError, LidarfwError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,16 +26,29 @@ def run(args: argparse.Namespace) -> int:
     from lidarfw.assembly import plan
 
     overrides = config.with_config_dirs(args.overrides)
+    _check_folder(overrides)
     if {"-m", "--multirun"} & set(overrides):  # the jobs of a sweep are planned one by one
-        config.compose(config.without_sweeps(overrides))
+        for job in config.jobs_to_compose(overrides):
+            config.compose(job)
     elif not any(argument.startswith("-") for argument in overrides):
         plan(config.compose(overrides))
     config.register()
     return _hydra(overrides)
 
 
+def _check_folder(overrides: list[str]) -> None:
+    """ConfigError where Hydra could not make the folder of the run."""
+    for override in overrides:
+        key, _, value = override.partition("=")
+        there = next((path for path in (Path(value), *Path(value).parents) if path.exists()), Path())
+        if key in ("hydra.run.dir", "hydra.sweep.dir") and not there.is_dir():
+            raise ConfigError(f"{override}: {there} is no folder.\n  fix: another {key}")
+
+
 def _hydra(arguments: list[str]) -> int:
     import hydra
+    from hydra.core.hydra_config import HydraConfig
+    from hydra.types import RunMode
     from omegaconf import DictConfig
 
     argv = sys.argv
@@ -47,8 +61,11 @@ def _hydra(arguments: list[str]) -> int:
 
         try:
             return train(cfg)
-        except LidarfwError as error:  # Hydra would print a trace; the other jobs of a sweep go on
-            failed.append(error)
+        except LidarfwError as error:
+            if HydraConfig.get().mode == RunMode.MULTIRUN:  # perhaps in another process: only Hydra brings it home
+                print(f"{HydraConfig.get().runtime.output_dir}: {error}", file=sys.stderr)
+                raise
+            failed.append(error)  # Hydra would print a trace
             return None
 
     sys.argv = [argv[0], *arguments]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
+
+from typing_extensions import Self
 
 from lidarfw.types import DataSpec, Frame, FrameMeta
 
@@ -22,6 +25,20 @@ class Dataset(ABC):
     example: ClassVar[dict[str, Any]] = {}  # options for the conformance kit
     spec: DataSpec
     split: str  # train, val, test, or what the dataset names
+    _given: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Note the options, whatever `__init__` makes of them."""
+        dataset = super().__new__(cls)
+        dataset._given = args, options
+        return dataset
+
+    def given_options(self) -> dict[str, Any]:
+        """The options it was made with, by name, defaults included: they tell it from others of its class."""
+        args, options = self._given
+        bound = inspect.signature(type(self).__init__).bind(self, *args, **options)
+        bound.apply_defaults()
+        return dict(list(bound.arguments.items())[1:])
 
     def prepare(self, workers: int = 0) -> None:
         """Make the files ready; called once, on one process, before the first frame is read.

@@ -71,6 +71,12 @@ def test_a_hundredth_of_the_map() -> None:
         assert found["recall@3_5m"] == float(rank <= 3)
 
 
+def test_a_map_that_was_not_evaluated_is_no_recall_of_nothing() -> None:
+    with pytest.raises(ConfigError, match=r"are elsewhere, but none of the 10 frames"):
+        figures(MAP, map_sequences=["elsewhere"])
+    assert figures([], map_sequences=["elsewhere"])["recall@1"] == 0
+
+
 def test_equal_descriptors_find_nothing() -> None:
     """A collapsed network gives one vector for all: no place may count as found."""
     found = figures([*[(s, t, x, 1.0) for s, t, x, _ in MAP], ("q", 0.0, 0.0, 1.0)], map_sequences=["map"])

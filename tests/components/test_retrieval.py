@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from lidarfw.cli import main
 from lidarfw.components.retrievers.exact import ExactRetriever
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.retrieval import Index, recall_at
@@ -182,6 +183,24 @@ def test_recall_golden() -> None:
     found = recall_at(matches, queries, index, radius=5.0, counts=(1, 2, 3))
     assert found == pytest.approx({"recall@1": 1 / 3, "recall@2": 2 / 3, "recall@3": 2 / 3})
     assert recall_at(matches, queries, index, radius=15.0, counts=(1,)) == {"recall@1": pytest.approx(1 / 3)}
+
+
+def test_a_place_without_a_pose_is_near_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not even a query at the origin."""
+    poses = poses_of([1.0, 0.0, 100.0])
+    poses.ok[:2] = False  # the first has numbers that are no pose
+    poses.matrix[1] = 0
+    retriever, vector = ExactRetriever(), unit(3)
+    retriever.build(Descriptors(vector), poses).save(tmp_path / "map.npz")
+    retriever.build(Descriptors(vector), poses_of([1.0, 0.0, 99.0])).save(tmp_path / "queries.npz")
+    assert Index.load(tmp_path / "map.npz").known.tolist() == [False, False, True]
+    for queries, recall in ((slice(0, 2), "0.0000"), (slice(0, 3), "1.0000")):
+        index = Index.load(tmp_path / "queries.npz")
+        index.replace(vector=index.vector[queries], pose=index.pose[queries], time=index.time[queries]).save(
+            tmp_path / "some.npz"
+        )
+        assert main(["index", "eval", str(tmp_path / "map.npz"), str(tmp_path / "some.npz"), "--counts", "3"]) == 0
+        assert recall in capsys.readouterr().out
 
 
 def test_recall_without_anything_is_zero() -> None:

@@ -102,6 +102,30 @@ def test_other_options_build_anew(dataset, folder, kitti_root):
     assert ObjectDatabase.load(folder).classes == ("Car",)
 
 
+class FromOneOn(KittiDataset):
+    """Keeps its option under no name of its own."""
+
+    def __init__(self, *, root: str, split: str = "train", begin: int = 0, workers: int = 0) -> None:
+        super().__init__(root=root, split=split)
+        self._order = [begin, 1 - begin]
+
+    def __getitem__(self, index):
+        return super().__getitem__(self._order[index])
+
+
+def test_an_option_that_the_dataset_does_not_show_builds_anew(kitti_root, tmp_path, monkeypatch):
+    cut, seen = object_database._cut, []
+
+    def counted(dataset, index, parts):
+        seen.append(index)
+        cut(dataset, index, parts)
+
+    monkeypatch.setattr(object_database, "_cut", counted)
+    for options, frames in (({}, 2), ({"begin": 1}, 4), ({"begin": 1, "workers": 3}, 4), ({"begin": 0}, 6)):
+        object_database.build(FromOneOn(root=str(kitti_root), **options), tmp_path / "database")
+        assert len(seen) == frames
+
+
 def test_a_broken_frame_is_named(dataset, tmp_path, kitti_root):
     (kitti_root / "training/velodyne/000001.bin").write_bytes(b"123")
     for workers in (1, 2):

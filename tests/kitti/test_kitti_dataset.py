@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import struct
 import subprocess
 import sys
+import zlib
 
 import numpy as np
 import pytest
@@ -303,6 +305,15 @@ def test_broken_pictures(kitti_root, size):
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(DataError, match=r"000000\.png"):
         _ = KittiDataset(root=str(kitti_root), split="train", image=True)[0]
+
+
+def test_a_picture_that_claims_too_many_pixels(kitti_root):
+    path = kitti_root / "training/image_2/000000.png"
+    content = path.read_bytes()
+    head = b"IHDR" + struct.pack(">II", 100_000, 100_000) + content[24:29]
+    path.write_bytes(content[:12] + head + struct.pack(">I", zlib.crc32(head)) + content[33:])
+    with pytest.raises(DataError, match=r"000000\.png: is not a readable picture: Image size"):
+        _ = KittiDataset(root=str(kitti_root), split="train")[0]
 
 
 def test_road_plane_in_the_lidar_frame(kitti_root):

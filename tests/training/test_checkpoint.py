@@ -7,17 +7,20 @@ import random
 import resource
 import shutil
 import signal
+import sys
 import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 import training_parts
+import yaml
 from training_runs import Child, settings
 
 import lidarfw
 from lidarfw import checkpoint
 from lidarfw.checkpoint import AtomicCheckpointIO
+from lidarfw.cli import main
 from lidarfw.errors import CheckpointError, ConfigError
 from lidarfw.training import evaluate, train
 from lidarfw.types import Frame, collate
@@ -233,6 +236,58 @@ class Payload:
         return self.call
 
 
+def name_class(path: Path, name: str) -> None:
+    """Let the checkpoint say that its head is of this type."""
+
+    def change(content):
+        head = yaml.safe_load(content["lidarfw"]["config"])
+        head["head"]["toy"]["type"] = name
+        content["lidarfw"]["config"] = yaml.safe_dump(head)
+
+    rewrite(path, change)
+
+
+@pytest.fixture
+def stranger(file, tmp_path, monkeypatch) -> Path:
+    """A checkpoint whose head is of a script that says when it is imported."""
+    script = (
+        "import pathlib, training_parts\npathlib.Path('marker').touch()\nclass Mine(training_parts.ToyHead): pass\n"
+    )
+    (tmp_path / "stranger.py").write_text(script)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "stranger", raising=False)
+    name_class(file, "stranger:Mine")
+    return file
+
+
+def test_a_class_of_no_plugin_is_not_imported(stranger, capsys):
+    for refused in (lidarfw.load, evaluate):
+        with pytest.raises(CheckpointError, match=r"head\.toy is 'stranger:Mine', of no installed plugin") as error:
+            refused(stranger)
+        assert "allow_unregistered=True" in str(error.value)
+    for command in ("eval", "show", "predict"):
+        assert main([command, str(stranger)]) == 2
+        assert "of no installed plugin" in capsys.readouterr().err
+    assert not Path("marker").exists()
+
+
+def test_a_class_of_ones_own_is_trusted_on_request(stranger):
+    model = lidarfw.load(stranger, allow_unregistered=True)
+    assert type(model.component(model.plan.of("head")[0])).__name__ == "Mine"
+    assert evaluate(stranger, allow_unregistered=True)["toy/frames"]
+
+
+def test_a_class_of_a_package_that_registers_others_is_loaded(file):
+    name_class(file, "training_parts:ToyHead")
+    assert lidarfw.load(file)
+    assert evaluate(file)["toy/frames"]
+    for name in ("training_parts:SLOTS", "training_parts.__main__:ToyHead", 3):
+        name_class(file, name)
+        with pytest.raises(CheckpointError, match=r"model\.ckpt"):
+            lidarfw.load(file)
+
+
 @pytest.mark.parametrize(
     "payload",
     [
@@ -335,7 +390,8 @@ def test_evaluate_does_not_depend_on_the_batch_size(trained):
     [("head.toy.depth=3", "head is part of the model"), ("backbone=toy", "backbone is part of the model"),
      ("optimizer.lr=1", "an evaluation does not train"), ("dataset.toy.frmes=3", "has no 'dataset.toy.frmes'"),
      ("dataset.kitti.root=x", "has no 'dataset.kitti.root'"), ("loader", "cannot read the overrides"),
-     ("splits.test=null", "there is no test data")],
+     ("splits.test=null", "there is no test data"), ("seed=abc", "seed must be a whole number"),
+     ("experiment=pillars_kitti", "experiment would set parts of the model"), ("~metric", "~metric has no effect")],
 )  # fmt: skip
 def test_evaluate_refuses(override, text, trained):
     with pytest.raises(ConfigError, match=text):

@@ -14,10 +14,13 @@ import pytest
 import training_parts
 from training_runs import assert_same_weights
 
+from lidarfw.assembly import plan
 from lidarfw.claims import judging, reading, reporting, running
 from lidarfw.claims.reading import Claim, Run
 from lidarfw.cli import main
+from lidarfw.config import compose
 from lidarfw.errors import ConfigError, DataError
+from lidarfw.evaluation import evaluation_config
 from lidarfw.resampling import draws
 
 TRAINED = Run("trained", ())
@@ -55,6 +58,15 @@ claims:
     better: higher
     long: true
 """
+
+
+def test_the_file_of_the_documentation_is_accepted(tmp_path):
+    pytest.importorskip("lidarfw_town")
+    text = (Path(__file__).parents[2] / "docs/claims.md").read_text().partition("```yaml\n")[2].partition("```")[0]
+    (tmp_path / "claims.yaml").write_text(text)
+    stated = reading.read(tmp_path / "claims.yaml")
+    for run in {run.name: run for claim in stated.claims for run in claim.runs}.values():
+        assert evaluation_config(plan(compose(list(run.overrides))).config, run.evaluation)
 
 
 class Forked:
@@ -207,6 +219,33 @@ def test_seeds_of_a_run_are_a_sweep_of_a_launcher(file, tmp_path, start):
     assert (start.of("train"), start.of("eval")) == (1, 2)
     assert all("hydra/launcher=basic" in arguments for arguments in start.started if arguments[0] == "train")
     assert work.result(stated.claims[0].variant, 2)["figures"]["toy/frames"] == 24
+
+
+def test_a_sweep_that_fails_is_not_taken_for_an_older_checkpoint(file, tmp_path, start):
+    stated = reading.read(file, ["dataset.toy.poison=3"])
+    work = running.Work(stated, [replace(stated.claims[0], baseline=0.5)], tmp_path / "runs")
+    for job in work.left:
+        (job.folder / "checkpoints").mkdir(parents=True)
+    runner = running.Runner(work, launcher="basic")
+    runner.run()
+    assert set(runner.failed) == set(work.jobs)
+    assert not any(job.trained for job in work.left)
+    log = (job.folder.parent / "log.txt").read_text()
+    assert all(f"{job.folder}: " in log for job in work.left)  # both are named
+    assert start.of("eval") == 0
+
+
+def test_a_training_without_a_checkpoint_fails_alone(file, tmp_path, start):
+    text = file.read_text().replace("untrained: [optimizer.lr=1e-7]", "untrained: [trainer.fast_dev_run=true]")
+    file.write_text(text.replace("seeds: [1, 2]", "seeds: [1]"))
+    stated = reading.read(file)
+    for launcher in (None, "basic"):
+        work = running.Work(stated, stated.claims[:1], tmp_path / f"runs_{launcher}")
+        runner = running.Runner(work, jobs=1, launcher=launcher)
+        runner.run()
+        ((folder, reason),) = runner.failed.items()
+        assert "left no checkpoints/last.ckpt" in reason
+        assert [job.folder for job in work.left] == [folder]
 
 
 def test_a_budget_starts_nothing_that_cannot_end_in_time(file, tmp_path, start):

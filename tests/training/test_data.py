@@ -225,6 +225,19 @@ def test_a_killed_worker_is_told_with_the_batch():
     assert "the batch that was waited for: train" in message
 
 
+def test_a_worker_that_dies_between_two_batches_is_told_too(monkeypatch):
+    """torch raises where the program is when the signal arrives: here while a batch is judged."""
+    judge = FrameLoader._judge
+
+    def slowly(self, bad):
+        time.sleep(2)
+        judge(self, bad)
+
+    monkeypatch.setattr(FrameLoader, "_judge", slowly)
+    with pytest.raises(DataError, match="worker died"):
+        list(loader(transforms=[Deadly()], workers=1))
+
+
 class Slow(Transform):
     def __call__(self, frame, rng):
         time.sleep(30)

@@ -75,6 +75,12 @@ def test_a_figure_that_should_be_small(run, tmp_path):
     assert best["global_step"] == min(at_validation, key=at_validation.get) + 1
 
 
+def test_a_figure_that_is_not_there_is_said(run, tmp_path):
+    with pytest.warns(UserWarning, match=r"no best.ckpt: there is no figure 'val/nope' .*\n.*val/toy/accuracy"):
+        run(tmp_path, "trainer.max_epochs=1", "callbacks.checkpoints.monitor=val/nope")
+    assert not (tmp_path / "checkpoints/best.ckpt").exists()
+
+
 def test_filters_that_hold_frames_back_lose_none(run, tmp_path):
     plain = run(tmp_path / "plain", "trainer.max_epochs=1")
     delayed = run(tmp_path / "delayed", "trainer.max_epochs=1", "filter=delay", "loader.batch_size=5")
@@ -257,7 +263,8 @@ def test_overfitting_repeats_the_same_batches(run, tmp_path, monkeypatch):
      ("optimizer.lr=-1", "optimizer: AdamW: Invalid learning rate"),
      ("+scheduler.foo=1", "scheduler: OneCycleLR: .*foo"), ("trainer.devices=-5", "trainer: "),
      ("balance=magic", "balance is 'magic'"), ("init={to: x}", "init takes"),
-     ("trainer.max_epochs=-1", "fix: trainer.max_epochs=N")],
+     ("trainer.max_epochs=-1", "fix: trainer.max_epochs=N"), ("seed=abc", "seed must be a whole number .* 'abc'"),
+     ("callbacks.checkpoints.mode=minimum", "mode is 'minimum'; use max or min")],
 )  # fmt: skip
 def test_wrong_settings(override, text, run, tmp_path):
     with pytest.raises(ConfigError, match=text):
@@ -303,6 +310,39 @@ def test_uncertainty_learns_its_weights(run, tmp_path):
 
 
 # --- average and start
+
+
+def test_frozen_parts_stay_as_they_are(run, tmp_path):
+    run(tmp_path / "first", "trainer.max_epochs=1")
+    start = f"init={{from: {tmp_path / 'first/checkpoints/last.ckpt'}, only: [backbone.toy]}}"
+    frozen = ["callbacks=freeze", "callbacks.freeze.parts=[backbone.toy]"]
+    settled = "+callbacks.settled={_target_: lidarfw.callbacks.SettledNorms}"
+    run(tmp_path / "second", start, *frozen, settled, "trainer.val_check_interval=2", "trainer.num_sanity_val_steps=1")
+    before, after = weights(tmp_path / "first"), weights(tmp_path / "second")
+    same = {name for name in before if torch.equal(before[name], after[name])}
+    assert same == {name for name in before if name.startswith("model.backbone.toy.")}
+    assert {name.rsplit(".", 1)[1] for name in same} >= {"weight", "running_mean", "running_var"}
+
+
+def test_frozen_parts_have_no_dropout(run, tmp_path, monkeypatch):
+    step, modes = PerceptionModule.training_step, []
+
+    def watch(self, batch, batch_idx):
+        modes.append((self.model.backbone["toy"].dropout.training, self.model.head["toy"].training))
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(PerceptionModule, "training_step", watch)
+    frozen = ["callbacks=freeze", "callbacks.freeze.parts=[backbone.toy]", "scheduler=constant"]
+    run(tmp_path, *frozen, "trainer.val_check_interval=2", "trainer.num_sanity_val_steps=1")
+    assert set(modes) == {(False, True)}
+    run(tmp_path, *frozen, "trainer.max_epochs=4", "resume=auto")
+    assert set(modes) == {(False, True)}
+
+
+@pytest.mark.parametrize(("parts", "wrong"), [("[backbone.second]", "no 'backbone.second'"), ("[]", "it is empty")])
+def test_only_parts_of_the_model_can_be_frozen(parts, wrong, run, tmp_path):
+    with pytest.raises(ConfigError, match=rf"{wrong}\n  fix: some of backbone.toy, head.toy"):
+        run(tmp_path, "callbacks=freeze", f"callbacks.freeze.parts={parts}")
 
 
 def test_ema_is_the_average_and_what_load_gives(run, tmp_path):

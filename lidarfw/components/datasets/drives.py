@@ -146,9 +146,9 @@ def _moved(scan: Points, drive: Drive, past: int, now: int) -> Points:
     return scan.replace(xyz=xyz.float(), time=time)
 
 
-def read_scan(path: Path) -> Points:
-    """A scan of float32 x, y, z, remission; DataError where remission is not 0..1."""
-    scan = read_points(path, columns=4)
+def read_scan(path: Path, repair: bool = False) -> Points:
+    """A scan of float32 x, y, z, remission; DataError where remission is not 0..1. `repair` as in `read_points`."""
+    scan = read_points(path, columns=4, repair=repair)
     low, high = float(scan.features.min()), float(scan.features.max())
     if low < 0 or high > 1:
         raise DataError(f"{path}: remission: expected 0..1, found {low:g}..{high:g}. Is it a scan of 4 columns?")
@@ -246,28 +246,42 @@ def read_boxes(path: Path, classes: Sequence[str], tracks: bool = False) -> tupl
     """Boxes of the classes and their track ids (M,), -1 where not given; boxes of other names are left out.
 
     A line is class x y z l w h yaw in lidarfw's conventions, and a whole number, the track id, which must be there
-    with `tracks`. DataError names the line that is wrong.
+    with `tracks`; no two boxes have the same. DataError names the line that is wrong.
     """
     lines = [(i, line.split()) for i, line in enumerate(kitti.read_text(path).splitlines(), 1) if line.strip()]
     for number, words in lines:
         if len(words) != 9 and (tracks or len(words) != 8):
             expected = "9 columns (class x y z l w h yaw track)" if tracks else "8 columns (class x y z l w h yaw)"
             raise DataError(f"{path}, line {number}: expected {expected}, found {len(words)}: {' '.join(words)[:80]}")
-    rows = [(words[0], _numbers(words[1:], f"{path}, line {number}")) for number, words in lines]
-    rows = [(name, values) for name, values in rows if name in classes]
-    label = torch.tensor([classes.index(name) for name, _ in rows], dtype=torch.long)
-    table = torch.tensor([values[:7] for _, values in rows], dtype=torch.float32).view(-1, 7)
-    track = torch.tensor([int(values[7]) if len(values) > 7 else -1 for _, values in rows], dtype=torch.long)
-    return Boxes.from_tensor(table, label), track
+    rows = [(number, words[0], _numbers(words[1:], f"{path}, line {number}")) for number, words in lines]
+    rows = [row for row in rows if row[1] in classes]
+    label = torch.tensor([classes.index(name) for _, name, _ in rows], dtype=torch.long)
+    table = torch.tensor([values[:7] for *_, values in rows], dtype=torch.float32).view(-1, 7)
+    ids = [int(values[7]) if len(values) > 7 else -1 for *_, values in rows]
+    _check_once(ids, [number for number, *_ in rows], path)
+    return Boxes.from_tensor(table, label), torch.tensor(ids, dtype=torch.long)
+
+
+def _check_once(ids: Sequence[int], lines: Sequence[int], path: Path) -> None:
+    """DataError where two lines of a file have the same track id."""
+    first: dict[int, int] = {}
+    for track, line in zip(ids, lines, strict=True):
+        if track >= 0 and first.setdefault(track, line) != line:
+            raise DataError(f"{path}, line {line}: expected each track id once, {track} is in line {first[track]} too")
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
+    """A box and perhaps its track id, which a double holds exactly."""
     try:
         values = [float(word) for word in words]
     except ValueError as error:
         raise DataError(f"{where}: expected numbers after the class: {error}") from None
-    if not np.isfinite(values).all() or min(values[3:6]) <= 0:
+    with np.errstate(over="ignore"):
+        box = np.array(values[:7], np.float32)
+    if not np.isfinite(box).all() or box[3:6].min() <= 0:
         raise DataError(f"{where}: expected finite numbers and positive l w h, found {' '.join(words)}")
+    if not all(track.is_integer() and abs(track) < 2**53 for track in values[7:]):
+        raise DataError(f"{where}: expected a whole number as the track id, found {words[7]}")
     return values
 
 

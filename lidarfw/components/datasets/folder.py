@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from lidarfw.components.datasets.drives import (
     read_table,
 )
 from lidarfw.errors import ConfigError, DataError
+from lidarfw.files import natural
 from lidarfw.io import SCAN_READERS, read_points
 from lidarfw.types import Boxes, DataSpec, Frame, PointLabels, Points, Poses, Spec, Targets, Tracks
 
@@ -104,7 +104,7 @@ class FolderDataset(DriveDataset):
 
     def present(self) -> list[str]:
         """ROOT itself where it holds scans, else its folders that do."""
-        places = [".", *sorted((p.name for p in self.folder.iterdir() if p.is_dir()), key=_natural)]
+        places = [".", *sorted((p.name for p in self.folder.iterdir() if p.is_dir()), key=natural)]
         found = [name for name in places if _scans(self.folder / name)]
         return found[:1] if "." in found else found
 
@@ -181,11 +181,6 @@ class FolderDataset(DriveDataset):
         return raw
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Order in which scan_2 comes before scan_10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
-
-
 def _one_each(rows: Array, count: int, path: Path) -> Array:
     if len(rows) != count:
         raise DataError(f"{path}: expected {count} lines, one per scan, found {len(rows)}")
@@ -207,7 +202,7 @@ def _scans(folder: Path) -> list[Path]:
     """Scan files of a sequence; DataError where two have the same name but for the suffix."""
     place = folder / "points" if (folder / "points").is_dir() else folder
     files = [path for path in place.iterdir() if path.suffix.lower() in SCAN_READERS and path.is_file()]
-    files.sort(key=lambda path: _natural(path.stem))
+    files.sort(key=lambda path: natural(path.stem))
     for first, second in itertools.pairwise(files):
         if first.stem == second.stem:
             raise DataError(f"{first} and {second.name}: a frame goes by its name, expected one file of each")

@@ -215,10 +215,9 @@ def padded_picture(path: str, camera: Camera, canvas: tuple[int, int]) -> Image:
 def picture_size(path: str) -> tuple[int, int]:
     """Width and height of a picture, from its header; DataError where it is none."""
     from PIL import Image as Picture
-    from PIL import UnidentifiedImageError
 
     try:
         with Picture.open(path) as picture:
             return picture.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise DataError(f"{path}: is not a readable picture: {error}") from error
+    except (OSError, ValueError, Picture.DecompressionBombError) as error:
+        raise DataError(f"{path}: is not a readable picture: {error}.\n  fix: copy it again") from error

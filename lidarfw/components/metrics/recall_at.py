@@ -29,7 +29,8 @@ class PlaceMetric(Metric):
     def __init__(self, descriptors: Spec, map_sequences: Sequence[str] = ()) -> None:
         super().__init__()
         self.channels = descriptors.channels
-        self.map = [sequence_number(str(name)) for name in map_sequences]
+        self.map_sequences = [str(name) for name in map_sequences]
+        self.map = [sequence_number(name) for name in self.map_sequences]
         self.add_state("vectors", default=[], dist_reduce_fx="cat")
         self.add_state("places", default=[], dist_reduce_fx="cat")
         self._start()
@@ -61,6 +62,20 @@ class PlaceMetric(Metric):
     def is_reference(self, frame: FrameMeta) -> bool:
         """Whether it is of the map, if sequences are named that are."""
         return sequence_number(frame.sequence) in self.map
+
+    def in_map(self, places: Tensor) -> Tensor:
+        """(F,) bool: frames of the sequences that are the map; all others query.
+
+        ConfigError where there are frames, but none of the map.
+        """
+        inside = torch.isin(places[:, 0], places.new_tensor(self.map))
+        if len(places) and not bool(inside.any()):
+            raise ConfigError(
+                f"map_sequences of the metric are {', '.join(self.map_sequences)}, but none of the {len(places)} "
+                "frames that were evaluated is of the map\n"
+                "  fix: metric.NAME.map_sequences=[...] with some of the sequences of the split"
+            )
+        return inside
 
     def gathered(self) -> tuple[Tensor, Tensor]:
         """Descriptors (F, D) and places (F, 6) of all frames; after an exchange the states are tensors, not lists."""
@@ -123,6 +138,8 @@ class RecallAt(PlaceMetric):
     def compute(self) -> dict[str, Any]:
         """The figures, as floats."""
         vectors, places = self.gathered()
+        if self.map:
+            self.in_map(places)  # looks whether there is one, before it is searched block by block
         rows = torch.arange(len(places), device=places.device)
         blocks = [self._search(rows[i : i + QUERIES], vectors, places) for i in range(0, len(places), QUERIES)]
         found = torch.cat([torch.zeros(0, 2 + 2 * len(self.radii)), *(block.cpu() for block in blocks)])

@@ -30,14 +30,18 @@ class ExactRetriever(Retriever):
         self.chunk = chunk
 
     def build(self, descriptors: Descriptors, poses: Poses) -> Index:
-        """The index of a map; its times are not known (NaN), set them by `index.replace(time=...)`."""
+        """The index of a map; its times are not known (NaN), set them by `index.replace(time=...)`.
+
+        A pose that is not ok is not known.
+        """
         vector = _finite(descriptors, "map")
         if len(vector) != poses.batch_size:
             raise DataError(
                 f"the map has {len(vector)} descriptors but {poses.batch_size} poses; each place needs both"
             )
         time = torch.full((len(vector),), torch.nan, dtype=torch.float64, device=vector.device)
-        return Index(vector, poses.matrix, time, descriptors.modality)
+        pose = poses.matrix.masked_fill(~poses.ok[:, None, None], 0)
+        return Index(vector, pose, time, descriptors.modality)
 
     def add(self, index: Index, descriptors: Descriptors, poses: Poses) -> Index:
         """The index with more places behind those it has; the modality is kept where both have it."""

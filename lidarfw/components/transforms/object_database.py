@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import multiprocessing
 import shutil
@@ -93,10 +92,19 @@ def _boxes(arrays: Arrays) -> Boxes:
 
 
 def describe(dataset: Dataset) -> dict[str, Any]:
-    """What decides the content of a database: the class of the dataset and its options."""
-    names = list(inspect.signature(type(dataset).__init__).parameters)[1:]
-    options = {name: getattr(dataset, name, None) for name in names}
-    return {"dataset": type(dataset).__name__, "classes": list(dataset.spec.classes), "frames": len(dataset)} | options
+    """What decides the content of a database: the class of the dataset, its options, and where its files lie.
+
+    A dataset that makes its files names their folder itself, perhaps by its version too.
+    """
+    options = {name: value for name, value in dataset.given_options().items() if name != "workers"}  # only for speed
+    return {
+        "dataset": type(dataset).__name__,
+        "classes": list(dataset.spec.classes),
+        "split": dataset.split,
+        "frames": len(dataset),
+        "root": getattr(dataset, "root", None),
+        "options": options,
+    }
 
 
 def build(dataset: Dataset, folder: str | Path, workers: int = 1) -> Path:

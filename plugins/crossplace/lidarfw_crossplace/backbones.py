@@ -7,6 +7,7 @@ table 1. The weights know nothing of the sensor: camera and LiDAR go through the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -62,7 +63,7 @@ class Trunk(nn.Module):
 
     def __init__(self, in_channels: int, network: str, chunk: int) -> None:
         super().__init__()
-        self.chunk = chunk
+        self.chunk, self._settled = chunk, False
         small, wide = network == "small", 4 if network in _BOTTLENECK else 1
         widths = (16, 32, 64, 128) if small else tuple(wide * width for width in (64, 128, 256, 512))
         first = 16 if small else 64
@@ -91,10 +92,25 @@ class Trunk(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Values 0..1 -> features, at least 0."""
+        if self.chunk and self.training and not self._settled:
+            self._look_at_norms()
         if not self.chunk or not torch.is_grad_enabled() or len(features) <= self.chunk:
             return self._run(features)
         parts = features.split(self.chunk)  # type: ignore[no-untyped-call]
         return torch.cat([checkpoint(self._run, part, use_reentrant=False) for part in parts])
+
+    def _look_at_norms(self) -> None:
+        """Warn where statistics that nothing will ever change are still those of the start: no normalisation at all."""
+        self._settled = True
+        norm = self.stem[1]
+        assert isinstance(norm, nn.BatchNorm2d)
+        assert norm.running_mean is not None
+        if not bool(norm.running_mean.any()):
+            warnings.warn(
+                "chunk keeps the statistics of batch normalisation as they are, and these are of no training: it does "
+                "nothing\n  fix: pretrained=microsoft/resnet-152 (or the network's own), init={from: CKPT}, or chunk=0",
+                stacklevel=2,
+            )
 
     def _run(self, features: Tensor) -> Tensor:
         features = features.expand(-1, len(self.mean), -1, -1)

@@ -36,6 +36,8 @@ class EitherSensor(Dataset):
 
     def __init__(self, *, of: str, options: dict[str, Any] | None = None, split: str = "train") -> None:
         """Options: of, name of the dataset; options, those of that dataset; split, one of its splits."""
+        if ":" in of:  # what a checkpoint names must not be imported from anywhere
+            raise ConfigError(f"dataset.either_sensor.of takes the name of an installed dataset, found {of!r}")
         self.split = split
         try:
             self.frames: Dataset = registry.load("dataset", of)(**(options or {}), split=split)

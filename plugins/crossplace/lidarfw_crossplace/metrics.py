@@ -30,8 +30,8 @@ class PlaceRecall(PlaceMetric):
     one), `ap`, `ceiling`, the share of queries with a right place at all, and `chance`, the recall@1 of guessing, as
     `2d3d_recall@1_10m`; for each direction `2d3d_error`, the mean distance in metres of the best matches, and
     `2d3d_queries`; and `recall@1`, the mean of 2d3d and 3d2d at the first radius, or of the directions that there are.
-    Queries without any right place count as misses
-    unless `exclude_hopeless`. Raises ConfigError for radii, counts and spacing that are not positive.
+    Queries without any right place count as misses unless `exclude_hopeless`. Raises ConfigError for radii, counts and
+    spacing that are not positive, and where no frame is of the map.
     """
 
     monitor: ClassVar[str] = "recall@1"
@@ -76,7 +76,7 @@ class PlaceRecall(PlaceMetric):
     def _roles(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Which frames (F,) are queries, and which the map."""
         if self.map:
-            in_map = torch.isin(places[:, 0], places.new_tensor(self.map))
+            in_map = self.in_map(places)
             return ~in_map, in_map
         queries = torch.zeros(len(places), dtype=torch.bool)
         for key in torch.unique(places[:, [0, 5]], dim=0):

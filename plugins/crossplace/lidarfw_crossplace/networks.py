@@ -132,18 +132,36 @@ class Said:
     @classmethod
     def load(cls, path: Path, settings: str) -> Said:
         """Read what `save` wrote. DataError for a broken file and for one of other settings."""
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} is broken: {error}\n  fix: remove it, it is made again") from error
-        if str(arrays.pop("settings", "")) != settings:
-            raise DataError(
-                f"{path} was made by other networks or for another panorama\n"
-                f"  it should be of: {settings}\n  fix: another folder for transform.panorama.cache, or remove it"
-            )
+        arrays = _arrays(path)
+        _compare(path, str(arrays.pop("settings", "")), settings)
         floats = {name: torch.from_numpy(array) for name, array in arrays.items()}
         return cls(**{name: value.float() if value.is_floating_point() else value for name, value in floats.items()})
+
+
+def _arrays(path: Path, only: str = "") -> dict[str, np.ndarray]:
+    """The arrays of a file by name, or `only` one, where it is there. DataError for a broken file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files if only in ("", name)}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path} is broken: {error}\n  fix: remove it, it is made again") from error
+
+
+def _compare(path: Path, found: str, expected: str) -> None:
+    if found != expected:
+        raise DataError(
+            f"{path} was made by other networks or for another panorama\n"
+            f"  expected: {expected}\n  found: {found or 'nothing about it'}\n"
+            "  fix: another folder for transform.panorama.cache, or remove what is in this one"
+        )
+
+
+def kept(path: Path, settings: str) -> bool:
+    """Whether an answer is there. DataError for one of other settings, and for a broken one."""
+    if not path.is_file():
+        return False
+    _compare(path, str(_arrays(path, "settings").get("settings", "")), settings)
+    return True
 
 
 def file_of(folder: str, frame: str) -> Path:

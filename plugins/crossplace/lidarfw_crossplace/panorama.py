@@ -12,12 +12,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch
 from lidarfw.errors import DataError
 from lidarfw.types import Camera, RangeView
 from torch import Tensor
 from torch.nn import functional as F
+
+from lidarfw_crossplace.alignment import Alignment, azimuth_of, place_of, rays_of
 
 FAR = 1e6  # metres: so far away that it does not matter where on the vehicle a camera sits
 _AXES = ((0.0, -1.0, 0.0, 0.0), (0.0, 0.0, -1.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))  # sensor -> camera
@@ -96,16 +97,17 @@ class Stitcher:
 
     def blend(self, pictures: Sequence[Tensor]) -> Tensor:
         """One panorama (C, H, W) of a picture (C, h, w) from each camera; 0 where none sees."""
-        seen = self._sampled(pictures, "bilinear")
+        seen = self.alone(pictures)
         return torch.stack([part * weight for part, weight in zip(seen, self.weight, strict=True)]).sum(0)
 
     def pick(self, pictures: Sequence[Tensor]) -> Tensor:
         """The same for labels and distances, which must not be mixed: a pixel of the camera that counts most."""
-        seen = torch.stack(self._sampled(pictures, "nearest"))
+        seen = torch.stack(self.alone(pictures, "nearest"))
         best = self.weight.argmax(0).expand(1, *seen.shape[1:])
         return torch.where(self.covered, seen.gather(0, best)[0], 0)
 
-    def _sampled(self, pictures: Sequence[Tensor], mode: str) -> list[Tensor]:
+    def alone(self, pictures: Sequence[Tensor], mode: str = "bilinear") -> list[Tensor]:
+        """What each camera gives by itself, (C, H, W); where it does not see, anything."""
         return [
             F.grid_sample(picture[None], place[None], mode, "border", align_corners=True)[0]
             for picture, place in zip(pictures, self.place, strict=True)
@@ -113,8 +115,14 @@ class Stitcher:
 
 
 @functools.lru_cache(maxsize=16)
-def stitcher(view: RangeView, cameras: tuple[Camera, ...], fov: float, radius: float = FAR) -> Stitcher:
-    """The stitcher of a rig (paper 3.1, alignment by calibration).
+def stitcher(
+    view: RangeView,
+    cameras: tuple[Camera, ...],
+    fov: float,
+    radius: float = FAR,
+    alignment: Alignment = Alignment(),  # noqa: B008 - frozen
+) -> Stitcher:
+    """The stitcher of a rig (paper 3.1), aligned by calibration, the second camera also by what both see.
 
     A camera counts by how far inside its field of view a pixel lies, which for two opposite fisheyes blends linearly
     over their overlap.
@@ -122,18 +130,26 @@ def stitcher(view: RangeView, cameras: tuple[Camera, ...], fov: float, radius: f
     Args:
         fov: field of view of the cameras in radians; beyond, a picture is not used.
         radius: metres to what is seen; `FAR` leaves out where the cameras sit.
+        alignment: of the second camera.
 
     DataError where the cameras see no pixel of the panorama.
     """
     pixels = torch.stack(torch.meshgrid(torch.arange(view.height), torch.arange(view.width), indexing="ij"), -1)
-    rays = view.direction(*pixels.double().unbind(2)).reshape(-1, 3) * radius
-    found = [_seen_by(camera, rays, fov) for camera in cameras]
+    rays = view.direction(*pixels.double().unbind(2)).reshape(-1, 3)
+    moved = [_moved(rays, camera, alignment) if number == 1 else rays for number, camera in enumerate(cameras)]
+    found = [_seen_by(camera, seen * radius, fov) for camera, seen in zip(cameras, moved, strict=True)]
     size = (len(cameras), view.height, view.width)
     weight = torch.stack([inside for _, inside in found]).view(size)
     if not bool(weight.any()):
         raise DataError("no camera sees any pixel of the panorama. Is the calibration that of this rig?")
     weight = weight / weight.sum(0).clamp(min=1e-12)
     return Stitcher(torch.stack([place for place, _ in found]).view(*size, 2).float(), weight.float())
+
+
+def _moved(rays: Tensor, camera: Camera, alignment: Alignment) -> Tensor:
+    """Where a camera shows what lies in these directions (N, 3)."""
+    axis = azimuth_of(camera)
+    return rays_of(alignment.moved(place_of(rays, axis)), axis) if alignment.coefficients else rays
 
 
 def _seen_by(camera: Camera, rays: Tensor, fov: float) -> tuple[Tensor, Tensor]:
@@ -193,25 +209,6 @@ def inpainted(values: Tensor, hole: Tensor) -> Tensor:
 
 
 # alignment without calibration
-
-
-def polynomial_terms(place: npt.NDArray[np.float64], degree: int) -> npt.NDArray[np.float64]:
-    """(N, T) products u^i v^j with i + j <= degree, in the order 1, u, v, u^2, u v, v^2, ... of places (N, 2)."""
-    u, v = place.T
-    return np.stack([u ** (total - j) * v**j for total in range(degree + 1) for j in range(total + 1)], 1)
-
-
-def fit_polynomial(
-    place: npt.NDArray[np.float64], target: npt.NDArray[np.float64], degree: int
-) -> npt.NDArray[np.float64]:
-    """Coefficients (T,) or (T, D) of the polynomial that takes places (N, 2) to targets (N,) or (N, D), least squares.
-
-    DataError where the places do not determine them.
-    """
-    terms = polynomial_terms(place, degree)
-    if np.linalg.matrix_rank(terms) < terms.shape[1]:
-        raise DataError(f"{len(place)} matches do not determine the {terms.shape[1]} coefficients of degree {degree}")
-    return np.linalg.lstsq(terms, target, rcond=None)[0].astype(np.float64)
 
 
 def rig_of(cameras: Mapping[str, Camera], names: Sequence[str]) -> tuple[Camera, ...]:

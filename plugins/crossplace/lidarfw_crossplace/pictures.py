@@ -8,6 +8,7 @@ there by camera and LiDAR, both panoramas of the same moment one above the other
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lidarfw.cli import answered
 from lidarfw.components.metrics.recall_at import precision_recall
 from lidarfw.draw import COLOURS, Picture, write_png
 from lidarfw.errors import ConfigError, DataError
@@ -195,7 +197,8 @@ def both_sensors(
     return _rendered(figure)
 
 
-def main() -> None:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Describe a split and draw what is found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", metavar="CKPT", help="of a model that describes places")
@@ -207,7 +210,7 @@ def main() -> None:
     parser.add_argument("--direction", choices=list(DIRECTIONS), default="", help="sensors of query and map")
     parser.add_argument("--head", default="", metavar="NAME", help="whose descriptors, of several: head.fused")
     parser.add_argument("--rows", type=int, default=6, help="of matches.png (%(default)s)")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     vectors, places, metas, inputs = _described(args.checkpoint, args.split, args.head)
     found = answers(vectors, places, searched_by(metas, args.apart, args.map, args.direction), args.radius)
     if not len(found.query):
@@ -255,4 +258,4 @@ def _descriptors(result: FrameResult, head: str) -> Descriptors:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

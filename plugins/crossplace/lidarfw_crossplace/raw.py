@@ -7,11 +7,14 @@ mean taken off, to unit length. They are judged by the metric of the experiment,
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+import sys
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import torch
-from lidarfw import assembly, config
+from lidarfw import config
+from lidarfw.cli import answered
+from lidarfw.data import evaluation_data
 from lidarfw.types import BEV, Descriptors, Frame, Image, Spec
 from omegaconf import OmegaConf
 from rich.progress import track
@@ -36,16 +39,13 @@ def judged(frames: Iterable[Frame], metric: PlaceRecall) -> dict[str, float]:
     return dict(metric.compute())
 
 
-def main() -> None:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Judge the split `test` of an experiment."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("overrides", nargs="*", help="those of the training")
-    settings = config.compose(parser.parse_args().overrides)
-    dataset = assembly.make_dataset(settings, settings.splits.test)
-    dataset.prepare()
-    transforms = assembly.make_transforms(settings, training=False)
-    for transform in transforms:
-        transform.attach(dataset)
+    settings = config.compose(parser.parse_args(arguments).overrides)
+    dataset, transforms = evaluation_data(settings, settings.splits.test)
 
     def changed(number: int) -> Frame:
         frame = dataset[number]
@@ -62,4 +62,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

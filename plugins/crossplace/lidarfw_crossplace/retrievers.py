@@ -28,6 +28,7 @@ from torch import Tensor
 
 log = logging.getLogger(__name__)
 KINDS = ("flat", "hnsw", "ivf_pq")
+_ENGINES = {"IndexFlat": "flat", "IndexFlatL2": "flat", "IndexHNSWFlat": "hnsw", "IndexIVFPQ": "ivf_pq"}
 _TRIED = 256  # queries of the report on an approximate index
 _PLACES_A_CELL = 64  # at most that the cells of ivf_pq are learnt from: a million places take a quarter of the time
 _ROWS = 1000  # at a time, to and from a database
@@ -112,7 +113,8 @@ class FaissRetriever(Retriever):
     ) -> None:
         """Options.
 
-        kind: flat, hnsw or ivf_pq. links, build_depth, search_depth: M, efConstruction and efSearch of hnsw. cells: of
+        kind: flat, hnsw or ivf_pq, of maps that are built; one that stands is searched as the kind that it is. links,
+        build_depth, search_depth: M, efConstruction and efSearch of hnsw. cells: of
         ivf_pq, 0 for 4 sqrt(N). probes: cells searched. code_bytes: of a place; must divide the descriptor's length.
         candidates: places of ivf_pq that are compared exactly.
         """
@@ -143,12 +145,13 @@ class FaissRetriever(Retriever):
 
     def report(self, index: FaissIndex) -> float:
         """Recall of the 10 nearest against exact search, of descriptors of the map; the log says it."""
-        if self.kind == "flat" or not len(index):
+        kind = _kind_of(index.engine)
+        if kind == "flat" or not len(index):
             return 1.0
         chosen = torch.linspace(0, len(index) - 1, min(len(index), _TRIED)).round().long()
         queries = Descriptors(index.vector[chosen], ())
         recall = agreement(self, index, queries, min(10, len(index)))
-        log.info("%s over %d places finds %.1f %% of the 10 truly nearest", self.kind, len(index), 100 * recall)
+        log.info("%s over %d places finds %.1f %% of the 10 truly nearest", kind, len(index), 100 * recall)
         return recall
 
     def _engine(self, count: int, width: int) -> Any:
@@ -179,17 +182,26 @@ class FaissRetriever(Retriever):
             raise ConfigError(f"the map has descriptors of {index.engine.d} numbers, the query has {vector.shape[1]}")
         if not len(vector):
             return Matches(torch.zeros(0, k, dtype=torch.long), torch.zeros(0, k))
-        wanted = max(k, self.candidates) if self.kind == "ivf_pq" else k
+        wanted = max(k, self.candidates) if _kind_of(index.engine) == "ivf_pq" else k
         rows = torch.from_numpy(self._search(index.engine, vector, min(wanted, max(len(index), 1))))
         return _sorted(index.vector, torch.from_numpy(vector), rows, k)
 
     def _search(self, engine: Any, vector: npt.NDArray[np.float32], k: int) -> npt.NDArray[np.int64]:
-        if self.kind == "hnsw":
+        kind = _kind_of(engine)
+        if kind == "hnsw":
             engine.hnsw.efSearch = max(self.search_depth, k)
-        elif self.kind == "ivf_pq":
+        elif kind == "ivf_pq":
             engine.nprobe = self.probes
         _, rows = engine.search(vector, k)
         return rows  # type: ignore[no-any-return]
+
+
+def _kind_of(engine: Any) -> str:
+    """The kind that a map was built as, whatever it is now asked with."""
+    name = type(engine).__name__
+    if name not in _ENGINES:
+        raise DataError(f"the map holds a FAISS {name}, expected one of: {', '.join(KINDS)}\n  fix: build it anew")
+    return _ENGINES[name]
 
 
 def _array(vector: Tensor) -> npt.NDArray[np.float32]:

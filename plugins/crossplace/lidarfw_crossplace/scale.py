@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -17,6 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
+from lidarfw.cli import answered
 from lidarfw.components.retrievers.exact import ExactRetriever
 from lidarfw.files import write_text
 from lidarfw.interfaces import Retriever
@@ -155,7 +157,8 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join([f"| {' | '.join(head)} |", "|---|" + "---:|" * (len(fields(Row)) - 1), *lines]) + "\n"
 
 
-def main() -> None:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--places", type=int, nargs="+", default=[10_000, 100_000], help="sizes of the map")
@@ -164,7 +167,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=512, help="(%(default)s)")
     parser.add_argument("--noise", type=float, default=0.3, help="of the descriptors (%(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
-    args = parser.parse_args()
+    args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO)
     rows = sweep(args.places, args.retrievers, args.width, args.queries, args.noise)
     print(table(rows))
@@ -173,4 +176,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -11,21 +13,25 @@ import numpy as np
 from lidarfw._lazy import LazyModule
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset, Transform
-from lidarfw.types import BEV, DataSpec, Frame, Image, Points, RangeView, Spec
+from lidarfw.types import BEV, Camera, DataSpec, Frame, Image, Points, RangeView, Spec
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+    from lidarfw_crossplace import alignment as aligning
     from lidarfw_crossplace import labels, networks, panorama
 else:
     torch = LazyModule("torch")
+    aligning = LazyModule("lidarfw_crossplace.alignment")
     networks = LazyModule("lidarfw_crossplace.networks")
     labels = LazyModule("lidarfw_crossplace.labels")
     panorama = LazyModule("lidarfw_crossplace.panorama")
 
 CHANNELS = {"intensity": 1, "depth": 1, "semantics": 3}
 FILLS = ("inpaint", "zero")
+log = logging.getLogger(__name__)
+_ALIGN_FRAMES = 50
 _EGO_FRAMES = 200
 _EGO_MOVES = 0.02  # standard deviation of the grey value below which a pixel shows the own vehicle
 
@@ -61,6 +67,7 @@ class Panorama(Transform):
         cameras: tuple[str, ...] = ("image_02", "image_03"),
         fov: float = 3.2288591161895095,
         power: float = 5.0,
+        alignment: str = "",
         ego_mask: str = "",
         ego_fill: str = "inpaint",
         depth_network: str = "",
@@ -74,11 +81,13 @@ class Panorama(Transform):
         maps: which of intensity, depth, semantics. stack: give them as one input `panorama`, for early fusion. height,
         width, up, down: pixels, and elevations of the upper and lower edge in radians. nearest, farthest: metres, of
         points. gap: rows of a column that are filled between two points, negative for any. cameras: inputs to stitch.
-        fov: of a camera, radians. power: of the depth of pictures. ego_mask: picture, white where the own vehicle is;
-        made from the frames if it is not there; empty for none. ego_fill: inpaint or zero, for intensity and depth of
-        cameras; the classes there are road. depth_network, semantics_network: of the library transformers, by name or
-        folder. inpaint_network: TorchScript file of LaMa, instead of the classical inpainting. cache: folder for what
-        these say. sphere: columns of the panorama that they look at.
+        fov: of a camera, radians. alignment: file that says where the second of two cameras shows what the first does,
+        by what both see (paper 3.1); made from the frames if it is not there; empty: by calibration alone. power: of
+        the depth of pictures. ego_mask: picture, white where the own vehicle is; made from the frames if it is not
+        there; empty for none. ego_fill: inpaint or zero, for intensity and depth of cameras; the classes there are
+        road. depth_network, semantics_network: of the library transformers, by name or folder. inpaint_network:
+        TorchScript file of LaMa, instead of the classical inpainting. cache: folder for what these say. sphere: columns
+        of the panorama that they look at.
         """
         unknown = [name for name in maps if name not in CHANNELS]
         if unknown or not maps or ego_fill not in FILLS:
@@ -89,7 +98,11 @@ class Panorama(Transform):
         self.maps, self.stack, self.cameras = tuple(maps), stack, tuple(cameras)
         self.view = RangeView(height, width, up, down)
         self.nearest, self.farthest, self.gap, self.fov, self.power = nearest, farthest, gap, fov, power
-        self.ego_mask, self.ego_fill = ego_mask, ego_fill
+        if alignment and len(self.cameras) != 2:
+            raise ConfigError(
+                f"transform 'panorama': alignment is of two cameras, there are {len(self.cameras)}\n  fix: alignment=''"
+            )
+        self.alignment, self.ego_mask, self.ego_fill = alignment, ego_mask, ego_fill
         self.networks = {"depth": depth_network, "semantics": semantics_network, "inpaint": inpaint_network}
         self.cache, self.sphere = cache, sphere
         if any(self.networks.values()) and not cache:
@@ -122,26 +135,41 @@ class Panorama(Transform):
         self.classes = tuple(dataset.spec.classes)
 
     def prepare(self, dataset: Dataset, workers: int = 1) -> None:
-        """Make the mask of the own vehicle from frames of the dataset, unless it stands, and ask the networks."""
+        """Make alignment and mask of the own vehicle from frames of the dataset, unless they stand; ask networks."""
+        if self.alignment and not Path(self.alignment).is_file():
+            self._align(dataset)
         if self.ego_mask and not Path(self.ego_mask).is_file():
             from lidarfw.draw import write_png
 
-            steps = np.linspace(0, len(dataset) - 1, min(len(dataset), _EGO_FRAMES)).round().astype(int)
-            greys = torch.stack([self._grey(dataset[int(number)]) for number in np.unique(steps)])
+            greys = torch.stack([self._seen(dataset[number]) for number in _spread(len(dataset), _EGO_FRAMES)])
             still = (greys.std(0, correction=0) < _EGO_MOVES) & (greys.mean(0) > 0)
             write_png(self.ego_mask, np.repeat((still[0].numpy() * np.uint8(255))[..., None], 3, 2))
-        if any(self.networks.values()):
+        if self._asked:
             self._ask_all(dataset, workers)
+
+    def _align(self, dataset: Dataset) -> None:
+        """Fit where the second camera shows what the first does, by frames of the dataset."""
+        view, found = RangeView(1024, 4096, math.pi / 4, -math.pi / 4), []
+        for number in _spread(len(dataset), _ALIGN_FRAMES):
+            rig, pictures = self._rig(dataset[number])
+            stitcher = panorama.stitcher(view, rig, self.fov)
+            one, other = (panorama.grey(part)[0] for part in stitcher.alone(pictures))
+            found.append(aligning.matches(one, other, (stitcher.weight > 0).all(0), view, aligning.azimuth_of(rig[1])))
+        try:
+            aligning.pooled(found).save(self.alignment)
+        except DataError as error:
+            log.warning("%s\n  the cameras are stitched by their calibration alone", error)
+            aligning.Alignment().save(self.alignment)
 
     def _ask_all(self, dataset: Dataset, workers: int) -> None:
         """Ask the networks about every frame that is not in the cache, `workers` frames at a time."""
         from rich.progress import track
 
-        metas = [dataset.meta(number) for number in range(len(dataset))]
+        metas, settings = [dataset.meta(number) for number in range(len(dataset))], self._settings()
         missing = [
             number
             for number, meta in enumerate(metas)
-            if meta.modality != "lidar" and not networks.file_of(self.cache, meta.id).is_file()
+            if meta.modality != "lidar" and not networks.kept(networks.file_of(self.cache, meta.id), settings)
         ]
         work = torch.utils.data.DataLoader(  # its processes are started, fed and ended by torch
             networks.Work(self, dataset, missing), None, num_workers=workers if workers > 1 else 0
@@ -183,6 +211,13 @@ class Panorama(Transform):
         """(N,) unified class of every point."""
         if frame.targets.points is not None and self.classes:
             return labels.table_of((*self.classes, "unlabeled"))[frame.targets.points.label]
+        missing = [f"{name}_semantics" for name in self.cameras if f"{name}_semantics" not in frame.inputs]
+        if missing:
+            raise DataError(
+                f"frame {frame.meta.id}: transform 'panorama' finds no classes of its points: they have no labels, and "
+                f"there is no input {missing[0]}\n"
+                "  fix: data with classes of points, or a model without the map semantics"
+            )
         xyz, found = frame.inputs["points"].xyz, torch.full((len(frame.inputs["points"]),), labels.UNKNOWN)
         for name in self.cameras:
             picture: Image = frame.inputs[f"{name}_semantics"]
@@ -203,14 +238,29 @@ class Panorama(Transform):
 
     def said(self, frame: Frame) -> networks.Said:
         """What networks say of the pictures of a frame: from the cache, else asked now and kept."""
-        if not any(self.networks.values()):
+        if not self._asked:
             return networks.Said()
-        path, settings = networks.file_of(self.cache, frame.meta.id), f"{self.networks} {self.view} {self.sphere}"
+        path, settings = networks.file_of(self.cache, frame.meta.id), self._settings()
         if path.is_file():
             return networks.Said.load(path, settings)
         said = self._ask(frame)
         said.save(path, settings)
         return said
+
+    @property
+    def _asked(self) -> list[str]:
+        """The maps that come from networks."""
+        answering = {"intensity": "inpaint", "depth": "depth", "semantics": "semantics"}
+        return [name for name in CHANNELS if name in self.maps and self.networks[answering[name]]]
+
+    def _settings(self) -> str:
+        """All that an answer depends on; of the own vehicle its mask, whatever its file is called."""
+        mask = hashlib.blake2b(self._ego.numpy().tobytes(), digest_size=8).hexdigest()
+        return (
+            f"{', '.join(self._asked)} by {self.networks} in {self.view} of {self.sphere} columns, cameras "
+            f"{', '.join(self.cameras)} of {self.fov} radians, {self._aligned}, own vehicle {mask} "
+            f"filled by {self.ego_fill}"
+        )
 
     def _ask(self, frame: Frame) -> networks.Said:
         """Let the networks look at the whole stitched panorama, and cut out what the LiDAR sees."""
@@ -218,23 +268,23 @@ class Panorama(Transform):
         stitcher, pictures = self._pictures(frame, view=whole)
         picture, crop = stitcher.blend(pictures), panorama.stitcher(self.view, (panorama.camera_of(whole),), math.pi)
         said = networks.Said()
-        if self._depth_network and "depth" in self.maps:
+        if "depth" in self.maps and self._depth_network:
             inverse = crop.blend([self._depth_network(picture)[None]])[0]
             covered = crop.blend([stitcher.covered[None].float()])[0] > 0.5
             said.depth = self._filled(panorama.depth_from_inverse(inverse, covered & ~self._ego)[None])[0]
-        if self._semantics_network and "semantics" in self.maps:
+        if "semantics" in self.maps and self._semantics_network:
             said.classes = crop.pick([self._semantics_network(picture)[None].float()])[0].to(torch.uint8)
-        if self._inpaint_network and "intensity" in self.maps:
+        if "intensity" in self._asked:
             said.intensity = self._grey(frame)[0]
         return said
 
     @functools.cached_property
-    def _depth_network(self) -> networks.DepthNetwork | None:
-        return networks.DepthNetwork(self.networks["depth"]) if self.networks["depth"] else None
+    def _depth_network(self) -> networks.DepthNetwork:
+        return networks.DepthNetwork(self.networks["depth"])
 
     @functools.cached_property
-    def _semantics_network(self) -> networks.SemanticNetwork | None:
-        return networks.SemanticNetwork(self.networks["semantics"]) if self.networks["semantics"] else None
+    def _semantics_network(self) -> networks.SemanticNetwork:
+        return networks.SemanticNetwork(self.networks["semantics"])
 
     @functools.cached_property
     def _inpaint_network(self) -> networks.InpaintingNetwork | None:
@@ -243,16 +293,30 @@ class Panorama(Transform):
     def _pictures(
         self, frame: Frame, kind: str = "", view: RangeView | None = None
     ) -> tuple[panorama.Stitcher, list[Tensor]]:
+        rig, pictures = self._rig(frame, kind)
+        return panorama.stitcher(view or self.view, rig, self.fov, alignment=self._aligned), pictures
+
+    def _rig(self, frame: Frame, kind: str = "") -> tuple[tuple[Camera, ...], list[Tensor]]:
+        """The cameras and their pictures (C, h, w)."""
         missing = [name for name in self.cameras if f"{name}{kind}" not in frame.inputs]
         if missing:
             raise DataError(f"frame {frame.meta.id} has no input {missing[0]}{kind}; it has {', '.join(frame.inputs)}")
         images = [frame.inputs[f"{name}{kind}"] for name in self.cameras]
-        rig = tuple(image.cameras[0] for image in images)
-        return panorama.stitcher(view or self.view, rig, self.fov), [image.features[0] for image in images]
+        return tuple(image.cameras[0] for image in images), [image.features[0] for image in images]
+
+    @property
+    def _aligned(self) -> aligning.Alignment:
+        if self.alignment and not Path(self.alignment).is_file():
+            raise DataError(f"{self.alignment}: no such file\n  fix: lidarfw prepare with this experiment makes it")
+        return aligning.Alignment.load(self.alignment) if self.alignment else aligning.Alignment()
+
+    def _seen(self, frame: Frame) -> Tensor:
+        """(1, H, W) grey values, own vehicle and all."""
+        stitcher, pictures = self._pictures(frame)
+        return panorama.grey(stitcher.blend(pictures))
 
     def _grey(self, frame: Frame) -> Tensor:
-        stitcher, pictures = self._pictures(frame)
-        return self._filled(panorama.grey(stitcher.blend(pictures)))
+        return self._filled(self._seen(frame))
 
     def _depth(self, frame: Frame, rng: np.random.Generator, said: networks.Said) -> Tensor:
         if said.depth is not None:
@@ -282,6 +346,11 @@ class Panorama(Transform):
     def _own_vehicle(self) -> Tensor:
         from lidarfw.io import read_image
 
+        if not Path(self.ego_mask).is_file():
+            raise DataError(
+                f"{self.ego_mask}: the mask of the own vehicle is not there (transform.panorama.ego_mask)\n"
+                "  fix: lidarfw prepare with the overrides of the training makes it, in the folder that this runs in"
+            )
         picture = read_image(Path(self.ego_mask))
         if picture.shape[:2] != (self.view.height, self.view.width):
             raise DataError(
@@ -293,9 +362,14 @@ class Panorama(Transform):
     @property
     def _ego(self) -> Tensor:
         """(H, W) bool: pixel shows the own vehicle."""
-        if not self.ego_mask or not Path(self.ego_mask).is_file():
+        if not self.ego_mask:
             return torch.zeros(self.view.height, self.view.width, dtype=torch.bool)
         return self._own_vehicle
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many numbers of frames, evenly spread."""
+    return [int(number) for number in np.unique(np.linspace(0, count - 1, min(count, most)).round())]
 
 
 class RandomHeading(Transform):

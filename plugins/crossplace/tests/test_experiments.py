@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import lidarfw
 import numpy as np
 import pytest
+import torch
 from lidarfw import config, predict
+from lidarfw.assembly import build, plan
+from lidarfw.checkpoint import describe
 from lidarfw.cli import main
 from lidarfw.components.datasets.kitti_360 import Kitti360Dataset
 from lidarfw.data import PairOrder
@@ -106,6 +110,8 @@ def test_pairs_are_of_both_sensors_in_half_of_the_cases() -> None:
     assert (first != second).mean() == pytest.approx(0.5, abs=0.06)
     with pytest.raises(ConfigError, match="do not fit 'synthetic'"):
         EitherSensor(of="synthetic", options={"colour": 1})
+    with pytest.raises(ConfigError, match="name of an installed dataset"):
+        EitherSensor(of="this:Data")
 
 
 def test_one_network_reads_one_map_or_all_of_them(capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,6 +164,69 @@ def test_a_branch_is_judged_though_fusion_replaces_it(tmp_path: Path) -> None:
     whole = evaluate(checkpoint)
     alone = evaluate(checkpoint, ["metric.place_recall.inputs.descriptors=head.place"])
     assert alone == pytest.approx(whole)  # fused of this branch alone
+    with pytest.raises(ConfigError, match=r"is of the map\n  fix: "):
+        evaluate(checkpoint, ["metric.place_recall.map_sequences=[elsewhere]"])
     model = lidarfw.load(checkpoint)
     result = next(iter(predict.predict_frames(model, [predict.SplitFrames(model, "val")[0]])))
     assert list(result.predictions) == ["head.late_fusion"]
+
+
+def test_a_split_is_described_with_the_classes_of_its_points(tmp_path: Path) -> None:
+    options = [
+        "dataset=synthetic", "dataset.synthetic.frames=2", "transform=panorama", "transform.panorama.maps=[semantics]",
+        "transform.panorama.height=16", "transform.panorama.width=64", "backbone=cosplace_small", "~neck",
+        "head=place_small", "loss=tsap", "metric=place_recall",
+    ]  # fmt: skip
+    wired = plan(config.compose(options))
+    weights = {f"model.{name}": value for name, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "a.ckpt")
+    command = ["index", "build", str(tmp_path / "a.ckpt"), "--split", "val", "-o", str(tmp_path / "map.npz")]
+    assert main(command) == 0
+
+
+@pytest.mark.parametrize("part", ["debug=fast", "trainer.limit_val_batches=1"])
+def test_a_part_of_a_split_may_lack_the_map(part: str, tmp_path: Path) -> None:
+    options = (
+        "dataset=either_sensor dataset.either_sensor.of=synthetic +dataset.either_sensor.options={frames:4,image:true} "
+        "transform=panorama transform.panorama.maps=[intensity] transform.panorama.cameras=[image] "
+        "transform.panorama.height=16 transform.panorama.width=64 backbone=cosplace_small ~neck head=place_small "
+        "head.place.channels=8 loss=tsap metric=place_recall metric.place_recall.map_sequences=[later] "
+        f"loader.batch_size=4 trainer.max_epochs=1 trainer.accelerator=cpu logger=none hydra.run.dir={tmp_path}"
+    )
+    assert main(["train", *options.split(), part]) == 0
+
+
+@pytest.mark.parametrize("name", ["crossplace_kitti360", "crossplace_nclt"])
+def test_the_presets_of_the_paper_start_from_pretrained_weights(name: str) -> None:
+    backbone = config.compose([f"experiment={name}"]).backbone.cosplace
+    assert (backbone.network, backbone.pretrained, backbone.chunk) == ("resnet152", "microsoft/resnet-152", 64)
+
+
+@pytest.mark.parametrize("name", ["crossplace_kitti360", "crossplace_nclt"])
+def test_scans_alone_query_a_map(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = [f"experiment={name}", "backbone=cosplace_small", "head=place_small", "transform.panorama.width=64"]
+    options += ["backbone.cosplace.pretrained=''"]
+    wired = plan(config.compose(options))
+    weights = {f"model.{part}": value for part, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "a.ckpt")
+    (tmp_path / "scans").mkdir()
+    for number in range(3):
+        ahead, remission = np.random.default_rng(number).uniform(-20, 20, (500, 3)), np.full((500, 1), 0.5)
+        np.save(tmp_path / "scans" / f"{number}.npy", np.hstack([ahead, remission]).astype(np.float32))
+    model, scans, place = str(tmp_path / "a.ckpt"), str(tmp_path / "scans"), str(tmp_path / "map.npz")
+    assert main(["index", "build", model, scans, "-o", place]) == 0
+    assert main(["index", "query", place, model, scans, "-k", "1"]) == 0
+    found = [row for row in capsys.readouterr().out.splitlines() if "place " in row]
+    assert [row.split(" (")[0] for row in found] == [f"{number}: place {number}" for number in range(3)]
+
+
+def test_a_checkpoint_needs_no_pretrained_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ["experiment=crossplace_kitti360", "backbone=cosplace_small", "head=place_small"]
+    wired = plan(config.compose([*options, "backbone.cosplace.pretrained=''"]))
+    weights = {f"model.{part}": value for part, value in build(wired).state_dict().items()}
+    about = describe(wired) | {"config": describe(plan(config.compose(options)))["config"]}
+    torch.save({"lidarfw": about, "state_dict": weights}, tmp_path / "a.ckpt")
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ConfigError, match="needs the library transformers"):
+        build(plan(config.compose(options)))
+    assert lidarfw.load(tmp_path / "a.ckpt").backbone["cosplace"].trunk.chunk == 64

@@ -81,6 +81,12 @@ def test_no_frames_and_wrong_options() -> None:
         PlaceRecall(Spec(Descriptors, 2), radii=())
 
 
+def test_a_map_that_was_not_evaluated_is_no_recall_of_nothing() -> None:
+    with pytest.raises(ConfigError, match=r"are 3, but none of the 7 frames .* is of the map\n  fix: .*map_sequences"):
+        metric(ROWS, POSITIONS, map_sequences=("3",))
+    assert PlaceRecall(Spec(Descriptors, 2), map_sequences=("3",)).compute() == {"recall@1": 0.0}
+
+
 def test_paired_test() -> None:
     right = torch.ones(100, dtype=torch.bool)
     assert mcnemar(right, right) == 1

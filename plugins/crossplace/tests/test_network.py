@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -73,6 +74,20 @@ def test_chunks_give_the_gradient_of_the_whole_batch() -> None:
         runs.append([p.grad for p in backbone.parameters()])
     for one, other in zip(*runs, strict=True):
         assert torch.allclose(one, other, rtol=1e-9, atol=1e-12)  # type: ignore[arg-type]
+
+
+def test_parts_without_a_trained_normalisation_are_pointed_out() -> None:
+    torch.manual_seed(0)
+    backbone = CosPlaceBackbone(Spec(Image, 1, 1, CAMERA), network="small", chunk=2).train()
+    with pytest.warns(UserWarning, match="pretrained=microsoft/resnet-152"):
+        backbone(picture(3, 1))
+    trained = CosPlaceBackbone(Spec(Image, 1, 1, CAMERA), network="small", chunk=0).train()
+    trained(picture(3, 1))
+    backbone = CosPlaceBackbone(Spec(Image, 1, 1, CAMERA), network="small", chunk=2).train()
+    backbone.load_state_dict(trained.state_dict())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        backbone(picture(3, 1))
 
 
 def test_weights_of_the_transformers_library_fit() -> None:

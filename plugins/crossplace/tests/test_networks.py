@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from lidarfw.draw import write_png
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.types import Camera, DataSpec, Frame, FrameMeta, Image, Spec, Targets
 from torch import Tensor, nn
@@ -90,6 +92,38 @@ def test_files_of_other_settings_and_broken_ones_are_refused(small: Panorama) ->
     with pytest.raises(DataError, match="is broken"):
         small.said(frames[1])
     assert file_of("x", "a/1") != file_of("x", "a_1")
+
+
+@pytest.mark.parametrize("change", [
+    {"maps": ("depth", "semantics"), "semantics_network": "any"}, {"maps": ("depth",), "semantics_network": "any"},
+    {"cameras": ("image_03", "image_02")}, {"fov": 2.0}, {"ego_fill": "zero"}, {"ego_mask": "ego.png"},
+    {"sphere": 64}, {"depth_network": "other"},
+])  # fmt: skip
+def test_what_was_said_for_other_settings_is_never_used(
+    small: Panorama, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: dict[str, Any]
+) -> None:
+    mask = np.zeros((8, 64, 3), np.uint8)
+    mask[4:, :10] = 255
+    write_png(tmp_path / "ego.png", mask)
+    monkeypatch.chdir(tmp_path)
+    frames = Frames()
+    small.prepare(frames)  # type: ignore[arg-type]
+    options = {"maps": ("intensity", "depth"), "width": 64, "height": 8, "depth_network": "any", "sphere": 128}
+    other = Panorama(**{**options, "cache": small.cache, **change})
+    with pytest.raises(DataError, match="another panorama"):
+        other(frames[0], np.random.default_rng(0))
+    with pytest.raises(DataError, match="another panorama"):
+        other.prepare(frames)  # type: ignore[arg-type]
+
+
+def test_maps_without_a_network_do_not_ask_for_other_answers(small: Panorama) -> None:
+    frames = Frames()
+    small.prepare(frames)  # type: ignore[arg-type]
+    same = Panorama(maps=("depth",), width=64, height=8, depth_network="any", cache=small.cache, sphere=128)
+    same.prepare(frames)  # type: ignore[arg-type]
+    none = Panorama(maps=("intensity",), width=64, height=8, depth_network="any", cache=small.cache)
+    none(frames[0], np.random.default_rng(0))
+    assert Brightness.asked == 3
 
 
 def test_kept_maps_come_back(tmp_path: Path) -> None:

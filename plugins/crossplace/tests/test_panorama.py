@@ -206,15 +206,6 @@ def test_no_data_is_black_and_road_is_not() -> None:
     assert colours[:, 0, 0].tolist() == pytest.approx([128 / 255, 64 / 255, 128 / 255])
 
 
-def test_polynomial_alignment() -> None:
-    u, v = np.meshgrid([0.0, 1, 2], [0.0, 1, 2])
-    place = np.stack([u.ravel(), v.ravel()], 1)
-    target = 1 + 0.5 * place[:, 0] - 0.25 * place[:, 1] + 0.1 * place[:, 0] ** 2 + 0.05 * place.prod(1)
-    assert panorama.fit_polynomial(place, target, 2).tolist() == pytest.approx([1, 0.5, -0.25, 0.1, 0.05, 0], abs=1e-9)
-    with pytest.raises(DataError, match="10 coefficients"):
-        panorama.fit_polynomial(place[:5], target[:5], 3)
-
-
 def test_own_vehicle_is_filled_and_its_classes_are_road(tmp_path: Path) -> None:
     from lidarfw.draw import write_png
 
@@ -262,3 +253,18 @@ def test_views_are_moved_by_metres() -> None:
     moved = turned(bev, 0.0, (1.0, -0.5)).features
     assert torch.allclose(moved[..., 1:, :-2], bev.features[..., :-1, 2:], atol=1e-5)
     assert torch.equal(turned(bev, 0.0).features, turned(bev, 0.0, (0.0, 0.0)).features)
+
+
+def test_classes_of_points_and_a_mask_that_are_not_there_are_asked_for(tmp_path: Path) -> None:
+    scan = Frame(
+        {"points": Points.from_scan(torch.rand(5, 3) * 20, torch.rand(5, 1))},
+        Targets(),
+        FrameMeta("f", modality="lidar"),
+    )
+    with pytest.raises(DataError, match="no input image_02_semantics\n  fix: "):
+        Panorama(maps=("semantics",))(scan, np.random.default_rng(0))
+    pictures = {f"image_0{i + 2}": Image(torch.rand(1, 3, 1200, 1200), (c,)) for i, c in enumerate(rig())}
+    frame = Frame(dict(pictures), Targets(), FrameMeta("f", modality="camera"))
+    masked = Panorama(maps=("intensity",), ego_mask=str(tmp_path / "ego.png"))
+    with pytest.raises(DataError, match=r"ego\.png.*is not there.*\n  fix: lidarfw prepare"):
+        masked(frame, np.random.default_rng(0))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 import torch
 from lidarfw.errors import ConfigError
 from lidarfw.types import Descriptors, FrameMeta, FrameResult, Image, RangeView, Record
 
-from lidarfw_crossplace import panorama
+from lidarfw_crossplace import panorama, pictures, raw, scale
 from lidarfw_crossplace.pictures import Answers, _descriptors, answers, both_sensors, examples, searched_by
 
 MODALITIES = ("camera", "lidar")
@@ -78,3 +81,15 @@ def test_one_of_several_heads_is_chosen() -> None:
     for wrong in ("", "head.c"):
         with pytest.raises(ConfigError, match=r"head\.a, head\.b: choose with --head"):
             _descriptors(result, wrong)
+
+
+def test_commands_say_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "faiss", None)
+    for command, arguments in (
+        (pictures, [str(tmp_path / "no.ckpt")]), (raw, ["experiment=no_such_thing"]),
+        (scale, ["--places", "8", "--queries", "2", "--width", "4", "--retrievers", "hnsw"]),
+    ):  # fmt: skip
+        assert command.main(arguments) == 2
+        assert capsys.readouterr().err

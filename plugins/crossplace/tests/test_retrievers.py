@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -112,3 +113,22 @@ def test_milvus_finds_what_exact_search_finds(tmp_path: Path) -> None:
     assert torch.equal(found.index, exact.index)
     assert torch.allclose(found.distance, exact.distance, atol=1e-3)
     assert (retriever.query(index, places, 62).index[:, 60:] == -1).all()
+
+
+@pytest.mark.parametrize("kind", ["flat", "hnsw", "ivf_pq"])
+def test_a_map_is_searched_as_the_kind_that_it_was_built_as(kind: str) -> None:
+    pytest.importorskip("faiss", reason="needs lidarfw-crossplace[faiss]")
+    places, poses = drive(2000)
+    index = FaissRetriever(kind=kind, code_bytes=8).build(places, poses)
+    queries = some(places, slice(0, 2000, 20))
+    expected = FaissRetriever(kind=kind, code_bytes=8).query(index, queries, 3)
+    for other in ("flat", "hnsw", "ivf_pq"):
+        assert torch.equal(FaissRetriever(kind=other).query(index, queries, 3).index, expected.index)
+
+
+def test_an_engine_of_another_kind_is_refused() -> None:
+    places, poses = drive(3)
+    rows = ExactRetriever().build(places, poses)
+    index = FaissIndex(rows.vector, rows.pose, rows.time, rows.modality, engine=SimpleNamespace(d=32))
+    with pytest.raises(DataError, match="holds a FAISS SimpleNamespace, expected one of: flat, hnsw, ivf_pq"):
+        FaissRetriever().query(index, places, 1)

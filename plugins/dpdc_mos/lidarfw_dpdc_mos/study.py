@@ -11,6 +11,7 @@ import argparse
 import dataclasses
 import itertools
 import json
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,9 +20,10 @@ from typing import Any
 import lidarfw
 import numpy as np
 import torch
-from lidarfw.assembly import make_dataset, make_transforms
 from lidarfw.checkpoint import config_of, description, read
+from lidarfw.cli import answered
 from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
+from lidarfw.data import evaluation_data
 from lidarfw.errors import DataError
 from lidarfw.evaluation import evaluation_config
 from lidarfw.files import write_text
@@ -103,8 +105,7 @@ def predictions(checkpoint: Path, overrides: Sequence[str], past: int = 0) -> It
     about = description(read(checkpoint), checkpoint)
     config = evaluation_config(config_of(about, checkpoint), list(overrides))
     model = lidarfw.load(checkpoint)
-    dataset, transforms = make_dataset(config, config.splits.test), make_transforms(config, training=False)
-    dataset.prepare()
+    dataset, transforms = evaluation_data(config, config.splits.test)
     for place, index in itertools.chain.from_iterable(map(enumerate, dataset.sequences())):
         frame = dataset[index]
         for change in transforms:
@@ -250,7 +251,8 @@ def markdown(table: dict[str, dict[str, float]]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m lidarfw_dpdc_mos.study", description=__doc__)
     parser.add_argument("checkpoint", type=Path)
@@ -273,7 +275,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(markdown(table))
     if args.json:
         write_text(args.json, json.dumps(table, indent=1) + "\n")
-    return 0
 
 
 def _light(seen: Seen) -> Seen:
@@ -282,4 +283,4 @@ def _light(seen: Seen) -> Seen:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    sys.exit(main())

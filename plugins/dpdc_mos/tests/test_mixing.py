@@ -12,6 +12,8 @@ import pytest
 import torch
 from lidarfw import merge, registry
 from lidarfw.assembly import build, make_transforms, plan
+from lidarfw.checkpoint import describe
+from lidarfw.cli import main
 from lidarfw.components.backbones.resnet import ResNetBackbone
 from lidarfw.config import compose
 from lidarfw.interfaces import Backbone, Head, Loss
@@ -256,3 +258,25 @@ def test_real_scans_go_through() -> None:
     changed = image.features[0, 2].flatten()[image.pixel] > 0.05
     assert float(changed[labels.label == 1].float().mean()) > 5 * float(changed[labels.label == 0].float().mean())
     assert float(image.mask.float().mean()) > 0.6
+
+
+def test_the_second_stage_leaves_the_first_as_it_is(tmp_path: Path) -> None:
+    """Its weights and the statistics of its normalisation."""
+    torch.manual_seed(0)
+    small = ["backbone.dpdc.stem=8", "backbone.dpdc.widths=[16,16,16]", *RANGE[1:]]
+    options = [
+        "experiment=mos_semantickitti_refine", "~dataset.semantic_kitti", *DATA, *small, "dataset.synthetic.frames=4",
+        "head.sparse_refine.cell=0.5", "head.sparse_refine.channels=8", "metric=mean_iou", "filter=[]",
+        "loss=sparse_refine", "loss.sparse_refine.frequency=null",
+        "splits={train: train, val: null, test: null}",
+    ]  # fmt: skip
+    wired = plan(compose(options))
+    before = {f"model.{name}": value for name, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": before}, tmp_path / "first.ckpt")
+    start = f"init={{from: {tmp_path / 'first.ckpt'}, only: [backbone.dpdc, head.moving_seg]}}"
+    run = ["trainer=cpu", "trainer.max_epochs=1", "logger=none", f"hydra.run.dir={tmp_path}"]
+    assert main(["train", *options, start, *run]) == 0
+    after = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed
+    assert all(name.startswith("model.head.sparse_refine.") for name in changed)

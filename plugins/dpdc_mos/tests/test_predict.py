@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -102,6 +103,31 @@ def test_a_sequence_becomes_labels_pictures_and_a_map(
     still = read_points(tmp_path / "map.ply").xyz
     assert 0 < len(still) < sum(len(np.fromfile(path, "<u4")) for path in found) - moving
     assert np.abs(still).max() < 120
+
+
+def test_broken_points_of_a_sequence_can_be_dropped(
+    checkpoint: Path, sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "08"
+    shutil.copytree(sequence, broken)
+    scan = broken / "velodyne" / "000001.bin"
+    table = np.fromfile(scan, "<f4").reshape(-1, 4)
+    table[[5, 9], 0] = np.nan
+    scan.write_bytes(table.tobytes())
+    assert cli(checkpoint, broken, "-o", tmp_path / "out") == 2
+    assert "--repair" in capsys.readouterr().err
+    assert cli(checkpoint, broken, "-o", tmp_path / "out", "--repair", "--no-pictures") == 0
+    ids = np.fromfile(tmp_path / "out/sequences/08/predictions/000001.label", "<u4")
+    assert len(ids) == len(table)  # one for every point of the file
+    assert np.flatnonzero(ids == 0).tolist() == [5, 9]
+
+
+@pytest.mark.parametrize("option", ["split", "poses", "map", "calib", "image", "columns", "intensity-max"])
+def test_what_a_sequence_does_not_take_is_refused(
+    option: str, checkpoint: Path, sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(checkpoint, sequence, "-o", tmp_path, f"--{option}", "8") == 2
+    assert f"--{option} does nothing for a sequence" in capsys.readouterr().err
 
 
 def test_past_scans_come_with_the_frames(checkpoint: Path, sequence: Path) -> None:

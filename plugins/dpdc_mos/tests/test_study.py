@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
+from lidarfw.assembly import build, plan
+from lidarfw.checkpoint import describe
+from lidarfw.components.datasets.semantic_kitti import SemanticKittiDataset
 from lidarfw.components.metrics.point_iou import MosIoU
+from lidarfw.config import compose
+from lidarfw.errors import DataError
 from lidarfw.ops import range_project
 from lidarfw.types import (
     DataSpec,
@@ -22,10 +28,19 @@ from lidarfw.types import (
 )
 
 from lidarfw_dpdc_mos.metrics import MosDetail
-from lidarfw_dpdc_mos.study import Seen, figures, fit_prior, markdown, matched_threshold, study
+from lidarfw_dpdc_mos.study import Seen, figures, fit_prior, main, markdown, matched_threshold, predictions, study
+from lidarfw_dpdc_mos.transforms import RangeProjection
 
 LABELS = Spec(PointLabels, classes=("static", "moving"))
 VIEW = RangeView(16, 128, math.radians(10), math.radians(-10))
+
+
+SMALL = [
+    "experiment=mos_finetune", "~dataset.town_mos", "dataset.semantic_kitti.root=nowhere",
+    "dataset.semantic_kitti.task=moving", "dataset.semantic_kitti.sweeps=5", "dataset.semantic_kitti.pose=true",
+    "backbone.dpdc.stem=8", "backbone.dpdc.widths=[16,16,16]",
+    "transform.range_projection.height=16", "transform.range_projection.width=128",
+]  # fmt: skip
 
 
 def one_hot(label: list[int], instance: list[int] | None = None) -> PointLabels:
@@ -130,3 +145,22 @@ def test_a_prior_that_depends_on_the_point() -> None:
     assert near > 0 > far
     assert b < 0
     assert math.isfinite(c)
+
+
+def test_transforms_know_the_dataset_before_frames_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    monkeypatch.setattr(RangeProjection, "prepare", lambda *_: calls.append("prepare"))
+    monkeypatch.setattr(RangeProjection, "attach", lambda *_: calls.append("attach"))
+    config = compose(SMALL)
+    wired = plan(config)
+    weights = {f"model.{name}": value for name, value in build(wired).state_dict().items()}
+    torch.save({"lidarfw": describe(wired), "state_dict": weights}, tmp_path / "mos.ckpt")
+    monkeypatch.setattr(SemanticKittiDataset, "prepare", lambda *_: calls.append("dataset"))
+    with pytest.raises(DataError):
+        next(predictions(tmp_path / "mos.ckpt", []))
+    assert calls == ["dataset", "prepare", "attach"]
+
+
+def test_the_command_says_what_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "no.ckpt")]) == 2
+    assert "no.ckpt" in capsys.readouterr().err

@@ -23,8 +23,9 @@ import lidarfw
 import torch
 from lidarfw import latency
 from lidarfw.assembly import build, plan
+from lidarfw.cli import answered
 from lidarfw.config import compose
-from lidarfw.errors import ConfigError, LidarfwError
+from lidarfw.errors import ConfigError
 from lidarfw.files import require_checkpoint, write_text
 from lidarfw.model import PerceptionModel
 from lidarfw.types import Batch, collate
@@ -162,8 +163,9 @@ def table(found: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; its exit code."""
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "what", metavar="CKPT|OVERRIDE", nargs="*", default=["experiment=msrm_town", "head.msrm.stages=4"]
@@ -172,22 +174,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=7, metavar="N", help="measurements of each (%(default)s)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     given = parser.parse_args(arguments)
-    try:
-        if given.what[0].endswith((".ckpt", ".safetensors")):
-            require_checkpoint(given.what[0])
-            model = lidarfw.load(given.what[0])
-        else:
-            model = build(plan(compose(given.what)))
-        model.eval()
-        frame = latency.read_frame(model, given.scan, None, None) if given.scan else latency.simulated_frame(model)
-        found = measure(model, collate([frame]), given.rounds)
-    except LidarfwError as error:
-        print(error, file=sys.stderr)
-        return 2
+    if given.what[0].endswith((".ckpt", ".safetensors")):
+        require_checkpoint(given.what[0])
+        model = lidarfw.load(given.what[0])
+    else:
+        model = build(plan(compose(given.what)))
+    model.eval()
+    frame = latency.read_frame(model, given.scan, None, None) if given.scan else latency.simulated_frame(model)
+    found = measure(model, collate([frame]), given.rounds)
     print(table(found))
     if given.json:
         write_text(given.json, json.dumps(found, indent=1) + "\n")
-    return 0
 
 
 if __name__ == "__main__":

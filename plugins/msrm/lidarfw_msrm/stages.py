@@ -26,15 +26,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from lidarfw import checkpoint
-from lidarfw.assembly import make_dataset, make_transforms
+from lidarfw.cli import answered
 from lidarfw.components.metrics.box_ap import BoxAP
 from lidarfw.components.postprocessors.nms import NMS
-from lidarfw.config import to_plain
-from lidarfw.errors import ConfigError, LidarfwError
+from lidarfw.data import evaluation_data
+from lidarfw.errors import ConfigError
 from lidarfw.evaluation import evaluation_config
 from lidarfw.files import atomic_path, require_checkpoint, write_text
-from lidarfw.interfaces import Metric
-from lidarfw.interfaces.data import Dataset
+from lidarfw.interfaces import Dataset, Metric, Transform
 from lidarfw.model import PerceptionModel
 from lidarfw.ops import box_corners, iou_3d
 from lidarfw.resampling import blocks, draws, interval
@@ -90,16 +89,15 @@ def detections(stages: Boxes, chosen: tuple[int, ...], regions: int | None = Non
     return kept
 
 
-def run(model: PerceptionModel, dataset: Dataset, transforms: Sequence[object]) -> Iterator[Seen]:
-    """The frames of a dataset, one by one."""
+def run(model: PerceptionModel, dataset: Dataset, transforms: Sequence[Transform]) -> Iterator[Seen]:
+    """The frames of a dataset that is ready, one by one."""
     head = next((module for module in model.modules() if isinstance(module, MSRMHead)), None)
     if head is None:
         raise ConfigError("the checkpoint has no head 'msrm'.\n  fix: one of experiment=msrm_town")
-    dataset.prepare()
     for number in track(range(len(dataset)), "frames", disable=not sys.stderr.isatty()):
         frame = dataset[number]
         for change in transforms:
-            frame = change(frame, np.random.default_rng(0))  # type: ignore[operator]
+            frame = change(frame, np.random.default_rng(0))
         with torch.no_grad():
             outputs = model(collate([frame]))
         output = next(value for value in outputs.values() if isinstance(value, MSRMOutput))
@@ -227,8 +225,9 @@ def _outline(box: torch.Tensor) -> tuple[list[float], list[float]]:
     return corners[:, 0].tolist(), corners[:, 1].tolist()
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; its exit code."""
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", metavar="CKPT")
     parser.add_argument("overrides", metavar="OVERRIDE", nargs="*", help="of `lidarfw eval`")
@@ -238,39 +237,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pictures", type=Path, metavar="DIR")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures too")
     given = parser.parse_args(arguments)
-    try:
-        require_checkpoint(given.checkpoint)
-        model = checkpoint.load(given.checkpoint).eval()
-        classes, stages = model.plan.data.classes, _stages(model)
-        seen = list(run(model, *data_of(given.checkpoint, given.overrides)))
-        frames = {name: measured(seen, classes, chosen) for name, chosen in ways(stages).items()}
-        found = {name: figures(joined(parts)) for name, parts in frames.items()}
-        few = {f"vote, {n} regions": figures(joined(measured(seen, classes, (), n))) for n in given.regions}
-        print(table(found | few, classes))
-        if given.resamples:
-            meta = [one.meta for one in seen]
-            drawn = {name: resampled(parts, meta, given.resamples, given.block) for name, parts in frames.items()}
-            print(f"\n{differences(found, drawn)}")
-        if given.json:
-            write_text(given.json, json.dumps(found | few, indent=1) + "\n")
-        if given.pictures:
-            for one in seen:
-                draw(given.pictures / f"{one.meta.id.replace('/', '_')}_stages.png", one, stages)
-    except LidarfwError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+    require_checkpoint(given.checkpoint)
+    model = checkpoint.load(given.checkpoint).eval()
+    classes, stages = model.plan.data.classes, _stages(model)
+    seen = list(run(model, *data_of(given.checkpoint, given.overrides)))
+    frames = {name: measured(seen, classes, chosen) for name, chosen in ways(stages).items()}
+    found = {name: figures(joined(parts)) for name, parts in frames.items()}
+    few = {f"vote, {n} regions": figures(joined(measured(seen, classes, (), n))) for n in given.regions}
+    print(table(found | few, classes))
+    if given.resamples:
+        meta = [one.meta for one in seen]
+        drawn = {name: resampled(parts, meta, given.resamples, given.block) for name, parts in frames.items()}
+        print(f"\n{differences(found, drawn)}")
+    if given.json:
+        write_text(given.json, json.dumps(found | few, indent=1) + "\n")
+    if given.pictures:
+        for one in seen:
+            draw(given.pictures / f"{one.meta.id.replace('/', '_')}_stages.png", one, stages)
 
 
 def _stages(model: PerceptionModel) -> int:
     return next((len(module.encoders) for module in model.modules() if isinstance(module, MSRMHead)), 0)
 
 
-def data_of(path: str, overrides: Sequence[str]) -> tuple[Dataset, Sequence[object]]:
-    """Test split and transforms of a checkpoint's config with overrides."""
+def data_of(path: str, overrides: Sequence[str]) -> tuple[Dataset, list[Transform]]:
+    """Test split and transforms of a checkpoint's config with overrides, ready to be read."""
     about = checkpoint.description(checkpoint.read(path), path)
-    config = to_plain(evaluation_config(checkpoint.config_of(about, path), overrides))
-    return make_dataset(config, config["splits"]["test"]), make_transforms(config, training=False)
+    config = evaluation_config(checkpoint.config_of(about, path), overrides)
+    return evaluation_data(config, config.splits.test)
 
 
 if __name__ == "__main__":

@@ -385,3 +385,8 @@ def test_training_lowers_every_term() -> None:
         optimizer.step()
         history.append({name: float(term) for name, term in terms.items()})
     assert all(history[-1][name] < history[0][name] / 2 for name in history[0]), (history[0], history[-1])
+
+
+def test_a_class_without_thresholds_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"foreground of Car is empty\n  fix: "):
+        thresholds(["Car", "Truck"], 3, {"Car": []})

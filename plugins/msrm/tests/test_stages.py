@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from lidarfw.components.transforms.crop import Crop
 from lidarfw.testing.synthetic import frames
 from lidarfw.types import Boxes, FrameMeta, Points
 
@@ -69,9 +70,13 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         "experiment=msrm_town", "dataset=synthetic", "dataset.synthetic.frames=2", "dataset.synthetic.points=2048",
         "backbone.resnet_se.cell=[0.4,0.4,0.2]", "head.msrm.grid=2", "head.msrm.regions=8", "head.msrm.neighbors=4",
         "trainer=cpu", "trainer.max_steps=1", "trainer.limit_val_batches=0", "logger=none", "metric=box_ap",
+        "transform.crop.boxes=false",
         "trainer.enable_progress_bar=false", "trainer.enable_model_summary=false", f"hydra.run.dir={tmp_path}",
     ]  # fmt: skip
     assert main(["train", *overrides]) == 0
+    calls: list[str] = []
+    monkeypatch.setattr(Crop, "prepare", lambda *_: calls.append("prepare"))
+    monkeypatch.setattr(Crop, "attach", lambda *_: calls.append("attach"))
     file = tmp_path / "figures.json"
     arguments = [str(tmp_path / "checkpoints" / "last.ckpt"), "--regions", "4", "--resamples", "2", "--block", "1"]
     assert stages.main([*arguments, "--json", str(file)]) == 0
@@ -84,4 +89,5 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         "vote",
         "vote, 4 regions",
     ]
+    assert calls == ["prepare", "attach"]
     assert stages.main([str(tmp_path / "no.ckpt")]) == 2

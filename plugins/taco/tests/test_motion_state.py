@@ -155,6 +155,43 @@ def test_a_file_keeps_the_states(tmp_path):
         MotionState(file=path, speed=0.1).attach(dataset)
 
 
+class Part(Drive):
+    """Some frames of a drive, of which `split` says nothing."""
+
+    def __init__(self, objects, part: str):
+        super().__init__(objects, frames=8, ids=False)
+        self.part, self.split = part, "all"
+
+    def meta(self, index: int) -> FrameMeta:
+        return FrameMeta(f"{self.part}/{index:03d}", "drive", index, index * self.period)
+
+
+def test_parts_of_one_split_keep_their_states_apart(tmp_path):
+    """As train and val of nuscenes_relocalization, which are frames of the same scenes."""
+    train, val = Part([PARKED, FAST], "train"), Part([FAST, PARKED], "val")
+    for part in (train, val):
+        MotionState(file=str(tmp_path / "motion")).prepare(part)
+    for part, expected in ((train, [0, 1]), (val, [1, 0])):
+        assert states(part, file=str(tmp_path / "motion"))[3] == expected
+
+
+def test_a_file_that_is_broken_or_of_others_is_made_anew(tmp_path):
+    dataset, transform = Drive([PARKED, FAST], ids=False), MotionState(file=str(tmp_path / "motion"))
+    transform.prepare(dataset)
+    (file,) = tmp_path.glob("motion_train_*.npz")
+    for content in (b"garbage" * 20, b"", file.read_bytes()[:200]):
+        file.write_bytes(content)
+        with pytest.raises(DataError, match="fix: lidarfw prepare"):
+            transform.attach(dataset)
+        transform.prepare(dataset)
+        assert states(dataset, file=transform.file)[3] == [0, 1]
+    np.savez(file, something=np.zeros(3))
+    with pytest.raises(DataError, match="fix: lidarfw prepare"):
+        transform.attach(dataset)
+    transform.prepare(dataset)
+    transform.attach(dataset)
+
+
 def test_boxes_that_were_dropped_before_are_noticed():
     dataset = Drive([PARKED, FAST])
     transform = MotionState()

@@ -7,14 +7,15 @@ log-odds that its box is right, so another detector needs two numbers per class 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from lidarfw.errors import DataError
+from lidarfw.components.per_class import check_names
+from lidarfw.errors import ConfigError, DataError
 from lidarfw.kitti import read_text
 
 from lidarfw_time3d.kalman import Array, Table
@@ -180,6 +181,17 @@ def _network(plain: Any) -> Network:
     if layers[0][0].shape[1] != len(columns):
         raise ValueError(f"{len(columns)} features, but weights for {layers[0][0].shape[1]}")
     return Network(columns, layers)
+
+
+def check_calibration(classes: Sequence[str], given: Mapping[str, Sequence[float]], option: str) -> None:
+    """ConfigError where the option named `option` is not scale and offset, two numbers, of classes of the data."""
+    check_names(classes, given, option)
+    wrong = next((name for name, row in given.items() if len(row) != 2), None)
+    if wrong is not None:
+        raise ConfigError(
+            f"{option} of {wrong} is {list(given[wrong])}, expected scale and offset of the scores\n"
+            f"  fix: calibration={{{wrong}: [1.0, 0.0]}}, or the two numbers of `python -m lidarfw_time3d.fit`"
+        )
 
 
 def log_odds(score: Array, label: npt.NDArray[np.int64], calibration: Array | None) -> Array:

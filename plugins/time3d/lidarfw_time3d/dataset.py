@@ -15,6 +15,8 @@ from lidarfw.errors import DataError
 from lidarfw.interfaces.data import Dataset
 from lidarfw.types import Boxes, DataSpec, Frame, FrameMeta, Poses, Spec, Targets, Tracks
 
+from lidarfw_time3d.confidence import check_calibration
+
 if TYPE_CHECKING:
     import torch
 else:
@@ -53,6 +55,8 @@ class KittiDetections(Dataset):
         """
         self.root, self.split, self.classes = root, split, tuple(classes)
         self.detections, self.poses, self.calibration = detections, poses, calibration
+        if calibration is not None:
+            check_calibration(self.classes, calibration, "dataset.kitti_detections.calibration")
         self.spec = DataSpec(
             {"boxes": Spec(Boxes, classes=self.classes), "pose": Spec(Poses)}, frozenset({Boxes, Tracks}), self.classes
         )

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import json
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,9 +26,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from lidarfw import detections, kitti
+from lidarfw.cli import answered
 from lidarfw.components.metrics.kitti_ap import share_covered
 from lidarfw.components.metrics.mot3d import Mot3D
 from lidarfw.detections import DetectedSequence, Detections
+from lidarfw.errors import DataError
 from lidarfw.files import write_text
 from lidarfw.mot import best_pairs
 from lidarfw.ops import iou_3d
@@ -69,8 +72,14 @@ class Labelled:
 
 
 def read(folder: Path, labels: Path, calib: Path, poses: Path | None, classes: Sequence[str]) -> list[Labelled]:
-    """Every sequence that has labels."""
-    names = [name for name in detections.kitti_sequences(folder) if (labels / f"{name}.txt").exists()]
+    """Every sequence that has labels; DataError where none has."""
+    there = detections.kitti_sequences(folder)
+    names = [name for name in there if (labels / f"{name}.txt").exists()]
+    if not names:
+        raise DataError(
+            f"{labels}: has no labels of the sequences that have detections, {', '.join(there)}\n"
+            "  fix: --labels FOLDER with SEQUENCE.txt of KITTI tracking, such as 0000.txt"
+        )
     return [_labelled(detections.read_kitti(folder, n, classes, poses, calib), labels, calib, classes) for n in names]
 
 
@@ -325,7 +334,8 @@ def _count(entry: Labelled, tracker: KalmanConfidence, metrics: dict[str, Mot3D]
             metric.update(tracks.replace(boxes=tracks.boxes.replace(score=score)), targets, [frame.meta])
 
 
-def main() -> None:
+@answered
+def main(arguments: Sequence[str] | None = None) -> None:
     """Fit, or cross-validate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("detections", type=Path, help="CLASS/SEQUENCE.txt")
@@ -339,23 +349,23 @@ def main() -> None:
         "--option", nargs="+", default=[], metavar="NAME=NUMBER", help="of the tracker: min_unseen=2 (nothing coasted)"
     )
     parser.add_argument("-o", "--output", type=Path, default=Path("weights.json"))
-    arguments = parser.parse_args()
-    options = {name: float(value) for name, _, value in (text.partition("=") for text in arguments.option)}
+    given = parser.parse_args(arguments)
+    options = {name: float(value) for name, _, value in (text.partition("=") for text in given.option)}
     torch.set_num_threads(1)
-    classes = detections.kitti_classes(arguments.detections)
-    data = read(arguments.detections, arguments.labels, arguments.calib, arguments.poses, classes)
-    if arguments.folds:
-        variants = VARIANTS if arguments.parts else {"cross-validated": Variant(options)}
-        found = cross_validate(data, classes, arguments.view, arguments.folds, variants)
+    classes = detections.kitti_classes(given.detections)
+    data = read(given.detections, given.labels, given.calib, given.poses, classes)
+    if given.folds:
+        variants = VARIANTS if given.parts else {"cross-validated": Variant(options)}
+        found = cross_validate(data, classes, given.view, given.folds, variants)
         for variant, (rules, kind) in itertools.product(found, itertools.product(("devkit", "clean"), classes)):
             figures = found[variant][rules]
             shown = {key: figures.get(f"{kind.lower()}_{key}", float("nan")) for key in ("samota", "mota", "ids")}
             print(f"{variant}: {rules} {kind}", " ".join(f"{key} {value:.4f}" for key, value in shown.items()))
         return
-    learnt = fit(data, classes, arguments.view, **options)
-    write_text(arguments.output, json.dumps(learnt))
-    print(f"{arguments.output}: calibration {learnt['calibration']}")
+    learnt = fit(data, classes, given.view, **options)
+    write_text(given.output, json.dumps(learnt))
+    print(f"{given.output}: calibration {learnt['calibration']}")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from lidarfw.components.per_class import check_names, per_class
+from lidarfw.components.per_class import per_class
 from lidarfw.interfaces import Tracker
 from lidarfw.types import Boxes, FrameResult, Poses, Spec, Tracks
 
 from lidarfw_time3d.assignment import gated_hungarian
-from lidarfw_time3d.confidence import FEATURES, Confidence, Evidence, features, log_odds
+from lidarfw_time3d.confidence import FEATURES, Confidence, Evidence, check_calibration, features, log_odds
 from lidarfw_time3d.frames import (
     array,
     boxes_of,
@@ -90,7 +90,7 @@ class KalmanConfidence(Tracker):
         self.gate = np.array(per_class(boxes.classes, gate, default_gate, "gate"))
         self.calibration = None
         if calibration is not None:
-            check_names(boxes.classes, calibration, "calibration")
+            check_calibration(boxes.classes, calibration, "calibration")
             self.calibration = np.array([calibration.get(name, (1.0, 0.0)) for name in boxes.classes])
         self.min_seen, self.min_unseen, self.max_age = min_seen, min_unseen, max_age
         self.field_of_view, self.frame_time = field_of_view, frame_time

@@ -96,3 +96,15 @@ def test_the_rule_shows_what_was_hit_three_times() -> None:
         values[:, FEATURES.index(name)] = column
     chance = fit.HitRule().probability(values, np.zeros(5), ("Car",))
     assert chance.tolist() == [0, 0, 0.5, 0, 0.5]  # the last one is in the first frame of a sequence
+
+
+def test_the_command_says_what_is_missing(drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rest = ["--calib", str(drives / "calib"), "-o", str(tmp_path / "weights.json")]
+    (tmp_path / "empty").mkdir()
+    for found, labels, wrong in (
+        (drives / "nowhere", drives / "label_02", "nowhere: there is no such folder of detections"),
+        (tmp_path / "empty", drives / "label_02", "empty: has no detections, expected CLASS/SEQUENCE.txt"),
+        (drives / "det", tmp_path / "empty", "has no labels of the sequences that have detections, 0000, 0001"),
+    ):
+        assert fit.main([str(found), "--labels", str(labels), *rest]) == 2
+        assert wrong in capsys.readouterr().err

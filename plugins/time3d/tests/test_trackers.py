@@ -20,6 +20,7 @@ from lidarfw_time3d.ab3dmot import AB3DMOT
 from lidarfw_time3d.assignment import gated_hungarian, greedy, hungarian
 from lidarfw_time3d.bench import measure
 from lidarfw_time3d.confidence import FEATURES, Confidence, log_odds
+from lidarfw_time3d.dataset import KittiDetections
 from lidarfw_time3d.kalman import Motion, Noise
 from lidarfw_time3d.kalman_confidence import KalmanConfidence, KalmanConfidenceState
 from lidarfw_time3d.kalman_offline import KalmanOffline, Moment, smooth
@@ -369,3 +370,11 @@ def test_offline_tracks_are_the_same_but_smoother_and_go_through_gaps() -> None:
     assert np.abs(error["offline"]).mean() < 0.8 * np.abs(error["online"]).mean()
     assert np.abs(np.diff(error["offline"], 2)).mean() < 0.5 * np.abs(np.diff(error["online"], 2)).mean()
     assert tracker.flush(tracker.start()) == []
+
+
+def test_calibrations_are_two_numbers_of_classes_of_the_data() -> None:
+    for given, wrong in (({"Car": [0.8]}, r"of Car is \[0.8\], expected scale and offset"), ({"car": [1, 0]}, "'Car'")):
+        with pytest.raises(ConfigError, match=wrong):
+            KalmanConfidence(Spec(Boxes, classes=("Car", "Pedestrian")), calibration=given)
+        with pytest.raises(ConfigError, match=wrong):
+            KittiDetections(root="nowhere", calibration=given)

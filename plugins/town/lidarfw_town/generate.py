@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -137,13 +138,23 @@ def generate(job: Job, workers: int = 1, *, quiet: bool = False) -> None:
     Another process that writes into the same folder is waited for.
     """
     job.check()
-    folder = Path(job.root) / ".town"
-    folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / "lock"):
+    with _locked(Path(job.root) / ".town"):
         job.claim()
         if not job.complete:
             _make(job, workers, quiet)
             job.finish()
+
+
+def _locked(folder: Path) -> AbstractContextManager[object]:
+    """The folder, made and for this process alone; DataError where that cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return FileLock(folder / "lock").acquire()
+    except OSError as error:
+        raise DataError(
+            f"cannot write {folder}: {error.strerror or error}.\n"
+            f"  fix: another folder (--out, or dataset.NAME.cache), or permission to write there"
+        ) from error
 
 
 def _make(job: Job, workers: int, quiet: bool) -> None:

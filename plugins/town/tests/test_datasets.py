@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from lidarfw import cli
 from lidarfw.components.datasets.kitti import KittiDataset
+from lidarfw.components.transforms.ground_truth_sampling import GroundTruthSampling
+from lidarfw.components.transforms.object_database import ObjectDatabase
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset
 
@@ -69,6 +71,16 @@ def test_splits_share_a_folder_that_the_options_name(cls: type[TownDataset]) -> 
         make(split="everything")
 
 
+def test_objects_of_another_town_are_not_pasted(ready: Callable[..., Any], tmp_path: Path) -> None:
+    """A database of objects stands for one town: with another seed it is cut out anew."""
+    sampling = GroundTruthSampling(database=str(tmp_path))
+    found = []
+    for seed in (1, 2):
+        sampling.prepare(ready(TownKitti, seed=seed, frames=1, picture_width=0, camera_view=False))
+        found.append(ObjectDatabase.load(tmp_path).points)
+    assert found[0].tobytes() != found[1].tobytes()
+
+
 def test_traversals_are_of_one_circuit(ready: Callable[..., Any]) -> None:
     """The second drive of training goes the other way round; the one held out goes as the first one does."""
     train, test = ready(TownOxford), ready(TownOxford, split="test")
@@ -124,6 +136,13 @@ def test_more_drives_than_the_layout_has_are_refused(cache: str) -> None:
         TownOxford(cache=cache, drives=5).prepare()
     assert TownMos(drives=9, split="val").job.frames == 60
     assert TownNuScenes(drives=9, length=10, split="val").job.frames == 40
+
+
+def test_a_cache_that_cannot_be_made_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["prepare", "dataset=town_mos", "dataset.town_mos.cache=/dev/null/c", "--workers", "1"]) == 2
+    told = capsys.readouterr().err
+    assert "cannot write /dev/null/c" in told
+    assert "dataset.NAME.cache" in told
 
 
 def test_a_truth_that_is_gone_is_told(ready: Callable[..., Any]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from lidarfw.assembly import make_dataset
+from lidarfw.components.datasets.nclt import NcltDataset
 from lidarfw.datacheck import check_dataset
 from lidarfw.errors import ConfigError, DataError
 from lidarfw.interfaces import Dataset
@@ -253,6 +254,14 @@ def test_the_command_reports_errors_plainly(tmp_path: Path, capsys: pytest.Captu
     assert "other settings" in capsys.readouterr().err
 
 
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["--out", str(tmp_path / "file" / "town")]) == 2
+    told = capsys.readouterr().err
+    assert f"cannot write {tmp_path / 'file' / 'town'}" in told
+    assert "fix: another folder" in told
+
+
 # what only one layout has
 
 
@@ -321,6 +330,19 @@ def test_nclt_cameras_are_those_of_the_rig(written: Job, dataset: Dataset) -> No
         assert (found - expected)[seen].abs().max() < 1e-3
         shot = photograph(drive_of(written, 0), truth(written, 1), camera).image
         assert torch.equal((frame.inputs[name].features[0] * 255).round().byte().permute(1, 2, 0), torch.tensor(shot))
+
+
+def test_nclt_leaves_out_what_the_format_cannot_hold(tmp_path: Path) -> None:
+    job = replace(job_of("nclt", tmp_path), picture_width=0)
+    drive, frame, parts = drive_of(job, 0), truth(job, 0), []
+    points = frame.points.copy()
+    points[:5, :3] = [[-100.1, 0, 0], [0, 100.1, 0], [0, 0, 100], [119, 0, 0], [0, -119, 0]]
+    for place in job.places()[:2]:  # a pose alone is no ground truth
+        parts.append(job.writer().write(replace(frame, points=points, time=float(place.index)), drive, place))
+    job.writer().finish([parts])
+    scan = NcltDataset(root=str(tmp_path), split="train")[0].inputs["points"]
+    assert np.abs(scan.xyz.numpy() - points[3:, :3]).max() < 0.0026
+    assert np.abs(scan.features[:, 0].numpy() - points[3:, 3]).max() <= 0.5 / 255 + 1e-6
 
 
 def test_nuscenes_tables(written: Job, dataset: Dataset) -> None:

@@ -57,6 +57,11 @@ def _column(name: str) -> str:
 def thresholds(classes: Sequence[str], stages: int, given: dict[str, list[float]] | None) -> Tensor:
     """(stages, K) foreground IoU; beyond the third stage the last step is repeated."""
     check_names(classes, given or {}, "foreground")
+    empty = next((name for name, row in (given or {}).items() if not row), None)
+    if empty is not None:
+        raise ConfigError(
+            f"foreground of {empty} is empty\n  fix: foreground={{{empty}: [0.5, 0.6]}}, an IoU for each stage"
+        )
     rows = [list((given or {}).get(name, FOREGROUND[_column(name)])) for name in classes]
     for row in rows:
         step = row[-1] - row[-2] if len(row) > 1 else 0.0

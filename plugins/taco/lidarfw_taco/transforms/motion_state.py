@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,9 +44,9 @@ class MotionState(Transform):
     cars would move. Comes before transforms that drop boxes. Needs poses, unless the boxes have velocities.
 
     The first frame of a sequence that is asked for reads the whole sequence. For large datasets name a `file`:
-    `lidarfw prepare`, or the training itself, then works all states out once and keeps them there. With `overwrite`
-    false, a state that the dataset knows (not -1) stays. `shuffle` is a control: the states are dealt out anew among
-    the objects of each frame, so that nothing which learns from them can gain.
+    `lidarfw prepare`, or the training itself, then works all states out once and keeps them in FILE_SPLIT_*.npz. With
+    `overwrite` false, a state that the dataset knows (not -1) stays. `shuffle` is a control: the states are dealt
+    out anew among the objects of each frame, so that nothing which learns from them can gain.
     """
 
     example: ClassVar[dict[str, Any]] = {}
@@ -144,20 +146,24 @@ class MotionState(Transform):
         return json.dumps({**describe(dataset), "speed": self.speed, "reach": self.reach}, sort_keys=True, default=str)
 
     def _path(self, dataset: Dataset) -> Path:
-        path = Path(self.file)
-        return path.with_name(f"{path.stem}_{dataset.split}.npz")
+        """The file of these very frames: not every dataset's `split` tells which of its frames it takes."""
+        path, digest = Path(self.file), hashlib.blake2b(digest_size=4)
+        for index in range(len(dataset)):
+            digest.update(dataset.meta(index).id.encode() + b"\n")
+        return path.with_name(f"{path.stem}_{dataset.split}_{digest.hexdigest()}.npz")
 
     def _read(self, dataset: Dataset) -> dict[int, list[State]] | None:
-        """The states in the file, or None where it is not one of this dataset with these options."""
-        if not self._path(dataset).is_file():
+        """The states in the file, or None where it is broken, or not one of this dataset with these options."""
+        try:
+            with np.load(self._path(dataset), allow_pickle=False) as file:
+                if str(file["settings"]) != self._settings(dataset):
+                    return None
+                return {
+                    place: np.split(file[f"{place}"], np.cumsum(file[f"count_{place}"])[:-1])
+                    for place in range(len(dataset.sequences()))
+                }
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
-        with np.load(self._path(dataset), allow_pickle=False) as file:
-            if str(file["settings"]) != self._settings(dataset):
-                return None
-            return {
-                place: np.split(file[f"{place}"], np.cumsum(file[f"count_{place}"])[:-1])
-                for place in range(len(dataset.sequences()))
-            }
 
 
 @dataclass

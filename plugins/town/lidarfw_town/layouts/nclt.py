@@ -27,8 +27,9 @@ class NcltLayout(Layout):
     """NCLT: ROOT/SESSION/{velodyne_sync,lb3}, ROOT/ground_truth, ROOT/{cam_params,U2D_ALL_1616X1232}.
 
     Every session goes round the same circuit of one town, every second one the other way. Scans are compensated for
-    ego motion; the format rounds them to 5 mm. Pictures of all six cameras are taken at the moment of the scan by
-    lenses without distortion. `width` is theirs; they lie on their side.
+    ego motion; the format rounds them to 5 mm, and has no room for points over 100 m behind, left or above. Pictures
+    of all six cameras are taken at the moment of the scan by lenses without distortion. `width` is theirs; they lie on
+    their side.
     """
 
     drives: ClassVar = {split: NcltDataset.splits[split] for split in ("train", "test")}
@@ -38,10 +39,7 @@ class NcltLayout(Layout):
         session = self.root / self.name(place.drive)
         begin = datetime.strptime(session.name, "%Y-%m-%d").replace(tzinfo=timezone.utc)
         stamp = int(begin.timestamp()) * 1_000_000 + round(frame.time * 1e6)
-        table = np.zeros(len(frame.points), _POINT)
-        table["place"] = np.round(((frame.points[:, :3] + LIDAR) @ _BODY[:3, :3] - _OFFSET) / _STEP)
-        table["intensity"], table["laser"] = np.round(frame.points[:, 3] * 255), rings(frame)
-        write_array(session / "velodyne_sync" / f"{stamp}.bin", table, _POINT)
+        write_array(session / "velodyne_sync" / f"{stamp}.bin", _scan(frame), _POINT)
         for name, camera in ladybug_cameras(self.width).items() if self.width else ():
             write_picture(session / "lb3" / name / f"{stamp}.tiff", photograph(drive, frame, camera).image)
         body = TO_NED @ frame.pose @ _TO_LIDAR
@@ -64,6 +62,16 @@ class NcltLayout(Layout):
         head = f"width/cols = {camera.width} , height/rows = {camera.height}\n"
         pixels = (f"{row} {column} {row} {column}\n" for row in range(camera.height) for column in range(camera.width))
         write_text(self.root / "U2D_ALL_1616X1232" / f"U2D_{name}_1616X1232.txt", head + "".join(pixels))
+
+
+def _scan(frame: TownFrame) -> np.ndarray:
+    """The points that the format can hold, -100 to 227.67 m along each axis of the body; others would wrap round."""
+    places = np.round(((frame.points[:, :3] + LIDAR) @ _BODY[:3, :3] - _OFFSET) / _STEP)
+    held = ((places >= 0) & (places <= np.iinfo(np.uint16).max)).all(1)
+    table = np.zeros(held.sum(), _POINT)
+    table["place"], table["laser"] = places[held], rings(frame)[held]
+    table["intensity"] = np.round(frame.points[held, 3] * 255)
+    return table
 
 
 def _table(rows: Sequence[Sequence[float]]) -> str:
