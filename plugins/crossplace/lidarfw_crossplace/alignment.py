@@ -6,7 +6,6 @@ polynomial says where the second shows what the first has at a place. It is fitt
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from collections.abc import Sequence
@@ -72,17 +71,14 @@ class Alignment:
     @classmethod
     def load(cls, path: str | Path) -> Alignment:
         """Read what `save` wrote; DataError where the file holds none."""
-        return _load(str(path))
-
-
-@functools.lru_cache(maxsize=8)
-def _load(path: str) -> Alignment:
-    try:
-        content: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
-        parts = {name: tuple((float(a), float(b)) for a, b in content[name]) for name in ("coefficients", "hull")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} holds no alignment of cameras: {error}\n  fix: remove it, it is made again") from error
-    return Alignment(**parts)
+        try:
+            content: dict[str, Any] = json.loads(Path(path).read_text(encoding="utf-8"))
+            parts = {name: tuple((float(a), float(b)) for a, b in content[name]) for name in ("coefficients", "hull")}
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{path} holds no alignment of cameras: {error}\n  fix: remove it, it is made again"
+            ) from error
+        return cls(**parts)
 
 
 def azimuth_of(camera: Camera) -> float:

@@ -304,7 +304,7 @@ class Panorama(Transform):
         images = [frame.inputs[f"{name}{kind}"] for name in self.cameras]
         return tuple(image.cameras[0] for image in images), [image.features[0] for image in images]
 
-    @property
+    @functools.cached_property
     def _aligned(self) -> aligning.Alignment:
         if self.alignment and not Path(self.alignment).is_file():
             raise DataError(f"{self.alignment}: no such file\n  fix: lidarfw prepare with this experiment makes it")
