@@ -1,46 +1,130 @@
-"""The product of many rows and a small matrix, by the fastest library that comes with torch.
+"""Products of many rows with small matrices, by the fastest library that comes with torch.
 
-`torch.mm` is MKL's, which keeps to AVX2 on processors that are not Intel's. oneDNN uses what the processor has:
-with AVX-512 that is twice the rate at 64 channels. It compiles a kernel for every new shape, which takes a third
-of a millisecond, so the number of rows is rounded up to one of a few.
+`torch.mm` is MKL's, which keeps to AVX2 on processors that are not Intel's. oneDNN uses what the processor has: with
+AVX-512 that is twice the rate at 64 channels. torch hands float32 to oneDNN where oneDNN is allowed bfloat16 inside,
+which it uses on processors with AMX only; whether all bits count is tried before it is taken. It compiles a kernel for
+every new shape, in half a millisecond, so it gets numbers of rows that are multiples of 512, at most 4096.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import threading
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-_STEP, _MOST = 512, 4096  # rows: of what oneDNN gets a multiple, and the most at a time; a compiled shape takes 0.1 MB
-_WORTH = 32 * 64  # elements of the matrix from which oneDNN's gain exceeds the copy of its result
+SLACK = 512  # rows that matrices must have beyond the last group; oneDNN gets a multiple of so many
+_MOST = 4096  # rows at a time; 8 compiled shapes of 0.1 MB for each shape of a weight
+_WORTH = 32 * 32  # elements of a weight from which oneDNN is faster
+_WORTH_TRANSPOSED = 32 * 64  # the same where it is the rows that are summed over
+
+_lock = threading.Lock()
+_users, _before = 0, "none"  # how many threads use oneDNN at the moment, and the setting to restore after the last
 
 
-def padded(rows: int) -> int:
-    """The rows that the first argument of `multiply` must have for so many."""
-    return -(-rows // _STEP) * _STEP
+def multiply(rows: Tensor, sizes: Sequence[int], weights: Sequence[Tensor], out: Tensor) -> None:
+    """Every group of rows times a matrix of its own.
 
+    Which library computes depends on the shape of the matrices alone, so a row's result does not depend on the others.
 
-def multiply(rows: Tensor, weight: Tensor, out: Tensor) -> None:
-    """out (N, C_out) = rows[:N] @ weight (C_in, C_out); rows (at least padded(N), C_in), the rest of any content.
-
-    Which library computes depends on the shape of the weight alone, so a row's result does not depend on the others.
+    Args:
+        rows: (N, C_in), the groups one after another; `SLACK` rows of any content behind the last.
+        sizes: rows of each group.
+        weights: (C_in, C_out) of each group.
+        out: (N, C_out), filled with the products; the slack rows are undefined afterwards.
     """
-    if not _onednn_is_faster() or rows.dtype != torch.float32 or rows.device.type != "cpu" or weight.numel() < _WORTH:
-        torch.mm(rows[: len(out)], weight, out=out)
+    if not weights or weights[0].numel() < _WORTH or not _is_for_onednn(rows):
+        groups = (matrix[: sum(sizes)].split_with_sizes(tuple(sizes)) for matrix in (rows, out))
+        for own, product, weight in zip(*groups, weights, strict=True):
+            torch.mm(own, weight, out=product)
         return
-    for begin in range(0, len(out), _MOST):
-        part = out[begin : begin + _MOST]
-        whole = rows[begin : begin + padded(len(part))]
-        part.copy_(torch.ops.mkldnn._linear_pointwise(whole, weight.t(), None, "none", [], "")[: len(part)])
+    with _onednn():
+        for start, size, weight in zip(accumulate(sizes, initial=0), sizes, weights):
+            for stretch in _stretches(start, start + _padded(size)):  # the next group overwrites what is too much
+                torch.mm(rows[stretch], weight, out=out[stretch])
+
+
+def add_product(rows: Tensor, weight: Tensor, out: Tensor) -> None:
+    """out (N, C_out) += rows (N, C_in) @ weight (C_in, C_out); as of `multiply`, a row's result is its own."""
+    if weight.numel() < _WORTH or not _is_for_onednn(rows):
+        out.addmm_(rows, weight)
+        return
+    whole = len(rows) // SLACK * SLACK
+    with _onednn():
+        for stretch in _stretches(0, whole):
+            out[stretch].addmm_(rows[stretch], weight)
+        last = rows.new_zeros(SLACK, rows.shape[1])
+        last[: len(rows) - whole] = rows[whole:]
+        out[whole:] += torch.mm(last, weight)[: len(rows) - whole]
+
+
+def add_transposed_product(rows: Tensor, others: Tensor, sizes: Sequence[int], outs: Sequence[Tensor]) -> None:
+    """To the out (C, D) of each group its rows (N, C), transposed, times its others (N, D) are added."""
+    onednn = bool(outs) and outs[0].numel() >= _WORTH_TRANSPOSED and _is_for_onednn(rows)
+    groups = list(zip(*(matrix.split_with_sizes(tuple(sizes)) for matrix in (rows, others)), outs, strict=True))
+    if onednn:
+        with _onednn():
+            for own, other, out in groups:
+                for stretch in _stretches(0, len(own) // SLACK * SLACK):
+                    out.addmm_(own[stretch].t(), other[stretch])
+    for own, other, out in groups:
+        rest = len(own) // SLACK * SLACK if onednn else 0
+        if rest < len(own):
+            out.addmm_(own[rest:].t(), other[rest:])
+
+
+def _padded(rows: int) -> int:
+    return -(-rows // SLACK) * SLACK
+
+
+def _stretches(begin: int, end: int) -> Iterator[slice]:
+    """From begin to end, multiples of SLACK apart, as many rows at a time as there are kernels for."""
+    return (slice(start, min(start + _MOST, end)) for start in range(begin, end, _MOST))
+
+
+def _is_for_onednn(rows: Tensor) -> bool:
+    return rows.dtype == torch.float32 and rows.device.type == "cpu" and _onednn_is_faster()
+
+
+@contextlib.contextmanager
+def _onednn() -> Iterator[None]:
+    """Within, torch computes float32 products by oneDNN. The setting is the whole process's, so threads share it."""
+    global _users, _before
+    setting = torch.backends.mkldnn.matmul  # type: ignore[attr-defined]
+    with _lock:
+        if not _users:
+            _before, setting.fp32_precision = setting.fp32_precision, "bf16"
+        _users += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _users -= 1
+            if not _users:
+                setting.fp32_precision = "none"  # as that of all backends
+                if setting.fp32_precision != _before:
+                    setting.fp32_precision = _before
 
 
 @functools.cache
 def _onednn_is_faster() -> bool:
-    """Whether the processor has AVX-512 and is not Intel's, and torch has oneDNN."""
+    """Whether the processor has AVX-512 and is not Intel's, and torch multiplies by oneDNN, in float32 throughout."""
     if torch.backends.cpu.get_cpu_capability() != "AVX512" or not torch.backends.mkldnn.is_available():  # type: ignore[no-untyped-call]
         return False
     cpuinfo = Path("/proc/cpuinfo")
     known = cpuinfo.exists() and "GenuineIntel" not in cpuinfo.read_text()
-    return known and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+    return known and hasattr(torch.backends.mkldnn, "matmul") and _onednn_is_exact()
+
+
+def _onednn_is_exact() -> bool:
+    """Whether products of whole numbers that float32 holds and bfloat16 does not come out right."""
+    rows = torch.arange(SLACK * 64).view(SLACK, 64) * 7919 % 1999 - 999
+    weight, others = rows[:64] % 201 - 100, rows % 33 - 16
+    with _onednn():
+        products = rows.float() @ weight.float(), rows.float().t() @ others.float()
+    return torch.equal(products[0], (rows @ weight).float()) and torch.equal(products[1], (rows.t() @ others).float())

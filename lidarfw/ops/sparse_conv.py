@@ -23,7 +23,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from lidarfw.errors import LidarfwError
-from lidarfw.ops.product import multiply, padded
+from lidarfw.ops.product import SLACK, add_product, add_transposed_product, multiply
 from lidarfw.ops.rulebook import Batch, Block, Kernel, Rulebook, Triple, strided_rulebook, submanifold_rulebook
 from lidarfw.ops.scratch import scratch
 from lidarfw.types import Voxels
@@ -44,15 +44,14 @@ def convolve(
     blocks, weights = book.blocks(), weight.unbind()
     output = features.new_empty(book.num_outputs, weight.shape[2])
     for block in blocks:
-        products = scratch("products", block.pairs, weight.shape[2], features)
-        rows = scratch("rows", block.largest + padded(1), weight.shape[1], features)  # the last run is padded too
+        products = scratch("products", block.pairs + SLACK, weight.shape[2], features)
+        rows = scratch("rows", block.largest + SLACK, weight.shape[1], features)
         for done, batch in _batches(block):
             torch.index_select(features, 0, batch.inputs, out=rows[: batch.pairs])
-            for start, element, product in _runs(batch, products[done : done + batch.pairs]):
-                multiply(rows[start:], weights[element], product)
+            multiply(rows, batch.sizes, [weights[element] for element in batch.elements], products[done:])
         total = sum_block(block, products)
         if book.symmetric:
-            total.addmm_(features[block.rows], weights[book.volume // 2])
+            add_product(features[block.rows], weights[book.volume // 2], total)
         total = total if bias is None else total.add_(bias)
         total = total.relu_() if rectify else total
         if len(blocks) == 1:
@@ -62,7 +61,7 @@ def convolve(
 
 
 def sum_block(block: Block, products: Tensor) -> Tensor:
-    """(rows, C) sums of the products (pairs, C) of a block."""
+    """(rows, C) sums of the products (at least pairs, C) of a block."""
     if not block.pairs:
         return products.new_zeros(block.rows.stop - block.rows.start, products.shape[1])
     return F.embedding_bag(block.order, products, block.starts, mode="sum", include_last_offset=True)
@@ -98,16 +97,16 @@ def _gradients(
     d_features = torch.empty_like(features) if need_features else None
     d_weight = torch.zeros_like(weight) if need_weight else None
     for block in book.blocks():
-        products = scratch("products", block.pairs, weight.shape[1], gradient)
+        products = scratch("products", block.pairs + SLACK, weight.shape[1], gradient)
         _block_gradients(block, features, gradient, flipped, products if need_features else None, d_weight)
         if d_features is not None:
             d_features[block.rows] = sum_block(block, products)
     if book.symmetric:
         centre = book.volume // 2
         if d_features is not None:
-            d_features.addmm_(gradient, flipped[centre])
+            add_product(gradient, flipped[centre], d_features)
         if d_weight is not None:
-            torch.mm(features.t(), gradient, out=d_weight[centre])
+            add_transposed_product(features, gradient, (len(features),), (d_weight[centre],))
     return d_features, d_weight
 
 
@@ -120,27 +119,20 @@ def _block_gradients(
     d_weight: Tensor | None,
 ) -> None:
     """Fill the products (pairs, C_in) that sum to the gradient of the features; add to the gradient of the weight."""
-    arrived = scratch("rows", block.largest + padded(1), gradient.shape[1], gradient)  # the last run is padded too
+    arrived = scratch("rows", block.largest + SLACK, gradient.shape[1], gradient)
     seen = scratch("features", block.largest, features.shape[1], features)
     for done, batch in _batches(block):
         rows = torch.index_select(gradient, 0, batch.inputs, out=arrived[: batch.pairs])
         if d_weight is not None:
-            torch.index_select(features, 0, batch.outputs, out=seen[: batch.pairs])
-            for start, element, own in _runs(batch, rows):
-                d_weight[element].addmm_(seen[start : start + len(own)].t(), own)
+            own = torch.index_select(features, 0, batch.outputs, out=seen[: batch.pairs])
+            add_transposed_product(own, rows, batch.sizes, [d_weight[element] for element in batch.elements])
         if products is not None:
-            for start, element, product in _runs(batch, products[done : done + batch.pairs]):
-                multiply(arrived[start:], flipped[element], product)
+            multiply(arrived, batch.sizes, [flipped[element] for element in batch.elements], products[done:])
 
 
 def _batches(block: Block) -> Iterator[tuple[int, Batch]]:
     """The batches, each with the number of pairs before it."""
     return zip(accumulate((batch.pairs for batch in block.batches), initial=0), block.batches)
-
-
-def _runs(batch: Batch, rows: Tensor) -> Iterator[tuple[int, int, Tensor]]:
-    """Of each kernel element in the batch: where its rows start, the element, its rows."""
-    return zip(accumulate(batch.sizes, initial=0), batch.elements, rows.split_with_sizes(batch.sizes))
 
 
 def triple(value: int | tuple[int, int, int]) -> Triple:
