@@ -3,7 +3,7 @@
 `torch.mm` is MKL's, which keeps to AVX2 on processors that are not Intel's. oneDNN uses what the processor has: with
 AVX-512 that is twice the rate at 64 channels. torch hands float32 to oneDNN where oneDNN is allowed bfloat16 inside,
 which it uses on processors with AMX only; whether all bits count is tried before it is taken. It compiles a kernel for
-every new shape, in half a millisecond, so it gets numbers of rows that are multiples of 512, at most 4096.
+every new shape, in half a millisecond and as many megabytes, so it gets a few numbers of rows only.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -18,8 +19,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-SLACK = 512  # rows that matrices must have beyond the last group; oneDNN gets a multiple of so many
-_MOST = 4096  # rows at a time; 8 compiled shapes of 0.1 MB for each shape of a weight
+from lidarfw.ops.scratch import scratch
+
+_KERNELS = (*range(512, 4097, 512), *range(5120, 8193, 1024))  # numbers of rows that oneDNN gets
+SLACK = 1024  # rows that matrices must have behind the last group: the largest gap between the numbers
 _WORTH = 32 * 32  # elements of a weight from which oneDNN is faster
 _WORTH_TRANSPOSED = 32 * 64  # the same where it is the rows that are summed over
 
@@ -45,7 +48,8 @@ def multiply(rows: Tensor, sizes: Sequence[int], weights: Sequence[Tensor], out:
         return
     with _onednn():
         for start, size, weight in zip(accumulate(sizes, initial=0), sizes, weights):
-            for stretch in _stretches(start, start + _padded(size)):  # the next group overwrites what is too much
+            for begin in range(start, start + size, _KERNELS[-1]):  # the next group overwrites what is too much
+                stretch = slice(begin, begin + _rounded_up(min(start + size - begin, _KERNELS[-1])))
                 torch.mm(rows[stretch], weight, out=out[stretch])
 
 
@@ -54,37 +58,36 @@ def add_product(rows: Tensor, weight: Tensor, out: Tensor) -> None:
     if weight.numel() < _WORTH or not _is_for_onednn(rows):
         out.addmm_(rows, weight)
         return
-    whole = len(rows) // SLACK * SLACK
     with _onednn():
-        for stretch in _stretches(0, whole):
-            out[stretch].addmm_(rows[stretch], weight)
-        last = rows.new_zeros(SLACK, rows.shape[1])
-        last[: len(rows) - whole] = rows[whole:]
-        out[whole:] += torch.mm(last, weight)[: len(rows) - whole]
+        for own, result in zip(torch.split(rows, _KERNELS[-1]), torch.split(out, _KERNELS[-1])):
+            whole = scratch("whole", _rounded_up(len(own)), rows.shape[1], rows)
+            whole[: len(own)] = own
+            result += torch.mm(whole, weight, out=scratch("product", len(whole), out.shape[1], out))[: len(own)]
 
 
 def add_transposed_product(rows: Tensor, others: Tensor, sizes: Sequence[int], outs: Sequence[Tensor]) -> None:
     """To the out (C, D) of each group its rows (N, C), transposed, times its others (N, D) are added."""
-    onednn = bool(outs) and outs[0].numel() >= _WORTH_TRANSPOSED and _is_for_onednn(rows)
     groups = list(zip(*(matrix.split_with_sizes(tuple(sizes)) for matrix in (rows, others)), outs, strict=True))
-    if onednn:
+    if outs and outs[0].numel() >= _WORTH_TRANSPOSED and _is_for_onednn(rows):
         with _onednn():
-            for own, other, out in groups:
-                for stretch in _stretches(0, len(own) // SLACK * SLACK):
-                    out.addmm_(own[stretch].t(), other[stretch])
+            groups = [_add_most(*group) for group in groups]
     for own, other, out in groups:
-        rest = len(own) // SLACK * SLACK if onednn else 0
-        if rest < len(own):
-            out.addmm_(own[rest:].t(), other[rest:])
+        if len(own):
+            out.addmm_(own.t(), other)
 
 
-def _padded(rows: int) -> int:
-    return -(-rows // SLACK) * SLACK
+def _add_most(rows: Tensor, others: Tensor, out: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Add the transposed product of all rows but the last, too few for the smallest kernel; what is left to add."""
+    while len(rows) >= _KERNELS[0]:
+        count = _KERNELS[bisect_right(_KERNELS, len(rows)) - 1]
+        out.addmm_(rows[:count].t(), others[:count])
+        rows, others = rows[count:], others[count:]
+    return rows, others, out
 
 
-def _stretches(begin: int, end: int) -> Iterator[slice]:
-    """From begin to end, multiples of SLACK apart, as many rows at a time as there are kernels for."""
-    return (slice(start, min(start + _MOST, end)) for start in range(begin, end, _MOST))
+def _rounded_up(rows: int) -> int:
+    """The smallest number of rows that there is a kernel for, of at least so many."""
+    return _KERNELS[bisect_left(_KERNELS, rows)]
 
 
 def _is_for_onednn(rows: Tensor) -> bool:
@@ -123,7 +126,7 @@ def _onednn_is_faster() -> bool:
 
 def _onednn_is_exact() -> bool:
     """Whether products of whole numbers that float32 holds and bfloat16 does not come out right."""
-    rows = torch.arange(SLACK * 64).view(SLACK, 64) * 7919 % 1999 - 999
+    rows = torch.arange(512 * 64).view(512, 64) * 7919 % 1999 - 999
     weight, others = rows[:64] % 201 - 100, rows % 33 - 16
     with _onednn():
         products = rows.float() @ weight.float(), rows.float().t() @ others.float()

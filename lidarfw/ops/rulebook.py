@@ -24,7 +24,7 @@ from lidarfw.types import Voxels
 Triple = tuple[int, int, int]
 
 _TABLE = 2**22  # chunks of the key space that the first lookup table counts: 16 MB
-_BLOCK_PAIRS = 2**16  # pairs computed at a time: their products, 16 MB at 64 channels, stay in the cache
+_BLOCK_PAIRS = 2**17  # pairs computed at a time: their products, 32 MB at 64 channels, stay in the cache
 _BATCH_PAIRS = 2**14  # pairs whose rows are gathered by one call, where several kernel elements have so few
 
 
