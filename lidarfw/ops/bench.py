@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from lidarfw import ops
 from lidarfw.ops import naive, rivals, sparse_conv
 from lidarfw.ops.inputs import random_boxes, street_scan
+from lidarfw.ops.product import compile_kernels
 from lidarfw.ops.rulebook import Kernel, strided_rulebook, submanifold_rulebook
 from lidarfw.types import Grid, Points, RangeView, SceneCoords, Voxels
 
@@ -154,7 +155,6 @@ def _backbone_cases(name: str, scan: Points, against: set[str]) -> Iterator[tupl
 
 def _layer_cases(voxels: Voxels) -> Iterator[tuple[str, dict[str, Run]]]:
     book = submanifold_rulebook(voxels, Kernel((3, 3, 3), padding=(1, 1, 1)))
-    book.blocks()
     for channels in (16, 32, 64, 128):
         features = torch.randn(len(voxels), channels, generator=torch.Generator().manual_seed(0))
         weight = torch.randn(27, channels, channels, generator=torch.Generator().manual_seed(1))
@@ -299,17 +299,21 @@ def growth(rounds: int) -> dict[str, float]:
 
 
 def _peak(engine: str, sweeps: int, threads: int, answer: Any) -> None:
-    """Send MB of resident memory that one forward pass takes above what stood before; runs in its own process."""
+    """Send what `peak_memory` returns; runs in its own process."""
     torch.set_num_threads(threads)
     voxels = ops.voxelize_mean(street_scan(sweeps, math.radians(41 if sweeps == 1 else 90)), GRID)
     channels = voxels.features.shape[1]
     net = (backbone(channels) if engine == "ours" else rivals.spconv_backbone(CHANNELS, channels)).eval()
-    torch.mm(torch.randn(500, 64), torch.randn(64, 64))  # the libraries' own working memory is no part of it
+    torch.mm(torch.randn(500, 64), torch.randn(64, 64))  # the libraries' own working memory is no part of it,
+    start = _status("VmRSS")
+    for layer in net.modules():
+        if isinstance(layer, sparse_conv.SparseConvolution):
+            compile_kernels(layer.weight.detach()[0])  # nor is what oneDNN compiles
     Path("/proc/self/clear_refs").write_text("5")
     before = _status("VmRSS")
     with torch.no_grad():
         net(fresh(voxels) if engine == "ours" else rivals.spconv_tensor(voxels))
-    answer.send((_status("VmHWM") - before) / 1024)
+    answer.send(((_status("VmHWM") - before) / 1024, (before - start) / 1024))
 
 
 def _status(name: str) -> int:
@@ -318,8 +322,11 @@ def _status(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(name))
 
 
-def peak_memory(engine: str, sweeps: int, threads: int = 1) -> float | None:
-    """MB that the backbone's forward pass of `engine` (ours or spconv) takes; None where there is no Linux /proc."""
+def peak_memory(engine: str, sweeps: int, threads: int = 1) -> tuple[float, float] | None:
+    """MB that the backbone's forward pass of `engine` (ours or spconv) takes at most, and that its kernels take.
+
+    The kernels are compiled once per process; MB of them are 0 where nothing is compiled. None without Linux' /proc.
+    """
     if not Path("/proc/self/clear_refs").exists():
         return None
     context = multiprocessing.get_context("spawn")
@@ -327,9 +334,9 @@ def peak_memory(engine: str, sweeps: int, threads: int = 1) -> float | None:
     process = context.Process(target=_peak, args=(engine, sweeps, threads, send))
     process.start()
     send.close()
-    value = float(receive.recv())
+    peak, kernels = receive.recv()
     process.join()
-    return value
+    return float(peak), float(kernels)
 
 
 def machine() -> dict[str, Any]:
@@ -383,8 +390,10 @@ def _figures(against: set[str], rounds: int) -> dict[str, float]:
             flops(fresh(voxels)) / (statistics.median(times) / 1e3) / rate
         )
         for engine in ("ours", *({"spconv"} & against)):
-            peak = peak_memory(engine, sweeps)
-            figures |= {} if peak is None else {f"peak MB of the forward pass, {engine} ({name})": peak}
+            memory = peak_memory(engine, sweeps)
+            if memory is not None:
+                figures[f"peak MB of the forward pass, {engine} ({name})"] = memory[0]
+                figures[f"MB of kernels compiled once, {engine} ({name})"] = memory[1]
     return figures | growth(rounds)
 
 

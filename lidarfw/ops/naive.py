@@ -19,12 +19,8 @@ def convolve(
 ) -> Tensor:
     """Sparse convolution element by element: gather, multiply, `index_add_`."""
     output = features.new_zeros(book.num_outputs, weight.shape[2])
-    inputs, outputs = book.inputs.long(), book.outputs.long()
-    start = 0
-    for element, count in zip(book.elements, book.counts, strict=True):
-        rows = slice(start, start + count)
-        output.index_add_(0, outputs[rows], features[inputs[rows]] @ weight[element])
-        start += count
+    for element, (inputs, outputs) in book.by_element().items():
+        output.index_add_(0, outputs.long(), features[inputs.long()] @ weight[element])
     output = output + features @ weight[book.volume // 2] if book.symmetric else output
     output = output if bias is None else output + bias
     return output.relu() if rectify else output

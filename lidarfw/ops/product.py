@@ -21,7 +21,7 @@ from torch import Tensor
 
 from lidarfw.ops.scratch import scratch
 
-_KERNELS = (*range(512, 4097, 512), *range(5120, 8193, 1024))  # numbers of rows that oneDNN gets
+_KERNELS: tuple[int, ...] = (*range(512, 4097, 512), *range(5120, 8193, 1024))  # numbers of rows that oneDNN gets
 SLACK = 1024  # rows that matrices must have behind the last group: the largest gap between the numbers
 _WORTH = 32 * 32  # elements of a weight from which oneDNN is faster
 _WORTH_TRANSPOSED = 32 * 64  # the same where it is the rows that are summed over
@@ -51,6 +51,13 @@ def multiply(rows: Tensor, sizes: Sequence[int], weights: Sequence[Tensor], out:
             for begin in range(start, start + size, _KERNELS[-1]):  # the next group overwrites what is too much
                 stretch = slice(begin, begin + _rounded_up(min(start + size - begin, _KERNELS[-1])))
                 torch.mm(rows[stretch], weight, out=out[stretch])
+
+
+def compile_kernels(weight: Tensor) -> None:
+    """Compile all that `multiply` needs for matrices like `weight` (C_in, C_out); else the first products do so."""
+    for count in _KERNELS:
+        rows, out = (weight.new_zeros(count + SLACK, channels) for channels in weight.shape)
+        multiply(rows, (count,), (weight,), out)
 
 
 def add_product(rows: Tensor, weight: Tensor, out: Tensor) -> None:

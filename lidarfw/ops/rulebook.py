@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import product
+from itertools import pairwise, product
 
 import torch
 from torch import Tensor
@@ -23,8 +23,8 @@ from lidarfw.types import Voxels
 
 Triple = tuple[int, int, int]
 
-_TABLE = 2**22  # chunks of the key space that the first lookup table counts: 16 MB
-_BLOCK_PAIRS = 2**17  # pairs computed at a time: their products, 32 MB at 64 channels, stay in the cache
+_TABLE = 2**21  # chunks of the key space that the first lookup table counts: 8 MB
+_BLOCK_PAIRS = 3 * 2**15  # pairs computed at a time: their products, 32 MB at 64 channels, stay in the cache
 _BATCH_PAIRS = 2**14  # pairs whose rows are gathered by one call, where several kernel elements have so few
 
 
@@ -71,6 +71,7 @@ class Block:
     """
 
     rows: slice  # output rows
+    inputs: Tensor  # (pairs,) int32 input rows, of all batches
     batches: tuple[Batch, ...]
     order: Tensor  # (pairs,) int32 pairs of the block sorted by output row
     starts: Tensor  # (rows + 1,) int32: row r of the block owns order[starts[r]:starts[r + 1]]
@@ -87,17 +88,15 @@ class Block:
 
 @dataclass
 class Rulebook:
-    """Pairs of input and output rows, grouped by kernel element; each group ascends in both."""
+    """Pairs of input and output rows, by block, and within it by kernel element; each such run ascends in both."""
 
     inputs: Tensor  # (P,) int32 row of the input
     outputs: Tensor  # (P,) int32 row of the output
-    elements: tuple[int, ...]  # kernel element of each group
-    counts: tuple[int, ...]  # pairs in each group
+    blocks: tuple[Block, ...]  # each of at most about `_BLOCK_PAIRS` pairs, covering all output rows
     num_inputs: int
     num_outputs: int
     volume: int  # elements of the kernel
     symmetric: bool = False  # submanifold: the pairs of an element are those of its mirror image, swapped
-    _blocks: list[Block] | None = field(default=None, repr=False)
     _transposed: Rulebook | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
@@ -109,79 +108,124 @@ class Rulebook:
         That of a submanifold convolution holds the same pairs, under mirrored kernel elements.
         """
         if self._transposed is None:
-            sides, elements = (self.outputs, self.inputs), self.elements
-            if self.symmetric:
-                sides, elements = (self.inputs, self.outputs), tuple(self.volume - 1 - e for e in elements)
-            sizes = self.num_outputs, self.num_inputs
-            self._transposed = Rulebook(*sides, elements, self.counts, *sizes, self.volume, self.symmetric)
+            self._transposed = self._mirrored() if self.symmetric else self._turned()
             self._transposed._transposed = self
         return self._transposed
+
+    def _mirrored(self) -> Rulebook:
+        def mirrored(batch: Batch) -> Batch:
+            return replace(batch, elements=tuple(self.volume - 1 - element for element in batch.elements))
+
+        blocks = (replace(block, batches=tuple(map(mirrored, block.batches))) for block in self.blocks)
+        return replace(self, blocks=tuple(blocks))
+
+    def _turned(self) -> Rulebook:
+        groups = self.by_element()
+        inputs, outputs = (torch.cat([self.inputs[:0], *(pair[side] for pair in groups.values())]) for side in (0, 1))
+        counts = [len(group) for group, _ in groups.values()]
+        return make_rulebook(outputs, inputs, list(groups), counts, self.num_outputs, self.num_inputs, self.volume)
+
+    def by_element(self) -> dict[int, tuple[Tensor, Tensor]]:
+        """Input and output rows, each (n,) int32 and ascending, of every kernel element that has pairs."""
+        runs: dict[int, list[tuple[Tensor, ...]]] = {}
+        for batch in (batch for block in self.blocks for batch in block.batches):
+            sides = (side.split_with_sizes(batch.sizes) for side in (batch.inputs, batch.outputs))
+            for element, run in zip(batch.elements, zip(*sides, strict=True), strict=True):
+                runs.setdefault(element, []).append(run)
+        whole = {element: [torch.cat(side) for side in zip(*runs[element], strict=True)] for element in sorted(runs)}
+        return {element: (inputs, outputs) for element, (inputs, outputs) in whole.items()}
 
     def pairs_per_output(self) -> Tensor:
         """(num_outputs,) int64."""
         return torch.bincount(self.outputs, minlength=self.num_outputs)
 
-    def blocks(self) -> list[Block]:
-        """The blocks, made at first use: each of at most about `_BLOCK_PAIRS` pairs, covering all output rows."""
-        if self._blocks is None and self.symmetric and self._transposed is not None and self._transposed._blocks:
-            self._blocks = [self._mirrored(block) for block in self._transposed._blocks]
-        if self._blocks is None:
-            starts = row_starts(self.pairs_per_output())
-            number = len(self) // _BLOCK_PAIRS + 1
-            first_rows = torch.searchsorted(starts, torch.arange(number, device=starts.device) * _BLOCK_PAIRS)
-            sizes = self._run_sizes(first_rows).view(-1).tolist()
-            inputs, outputs = (side.split_with_sizes(sizes) for side in (self.inputs, self.outputs))
-            rows = [*first_rows.tolist(), self.num_outputs]
-            self._blocks = [
-                self._block(slice(*rows[b : b + 2]), inputs[b::number], outputs[b::number], sizes[b::number], starts)
-                for b in range(number)
-            ]
-        return self._blocks
 
-    def _mirrored(self, block: Block) -> Block:
-        mirror = [tuple(self.volume - 1 - element for element in batch.elements) for batch in block.batches]
-        batches = (replace(b, elements=elements) for b, elements in zip(block.batches, mirror, strict=True))
-        return replace(block, batches=tuple(batches))
+def make_rulebook(
+    inputs: Tensor,
+    outputs: Tensor,
+    elements: Sequence[int],
+    counts: Sequence[int],
+    num_inputs: int,
+    num_outputs: int,
+    volume: int,
+    symmetric: bool = False,
+    order: Tensor | None = None,
+) -> Rulebook:
+    """The rulebook of pairs (P,) int32 that come grouped by kernel element, each group ascending in both.
 
-    def _run_sizes(self, first_rows: Tensor) -> Tensor:
-        """(groups, blocks) int64 pairs of each group that reach the rows of each block."""
-        ends = torch.tensor(self.counts, dtype=torch.long, device=first_rows.device)[:, None]
-        if len(first_rows) == 1 or not self.counts:
-            return ends
-        groups = self.outputs.split_with_sizes(self.counts)
-        begins = torch.stack([torch.searchsorted(group, first_rows.int()) for group in groups])
-        return torch.cat([begins, ends], 1).diff(dim=1)
-
-    def _block(
-        self, rows: slice, inputs: Sequence[Tensor], outputs: Sequence[Tensor], sizes: Sequence[int], starts: Tensor
-    ) -> Block:
-        runs = [run for run in zip(inputs, outputs, self.elements, sizes, strict=True) if run[-1]]
-        batches = tuple(_batch(some) for some in _batched(runs))
-        local = torch.cat([self.outputs[:0], *(batch.outputs for batch in batches)])
-        if rows.stop - rows.start < 2**15:  # fewer digits for the radix sort
-            local = (local - rows.start).short()
-        order, own = torch.sort(local, stable=True)[1].int(), starts[rows.start : rows.stop + 1]
-        return Block(rows, batches, order, (own - own[0]).int())
+    Args:
+        elements: kernel element of each group.
+        counts: pairs in each group.
+        order: (P,) the pairs sorted by output row, stably, where it is known.
+    """
+    starts = row_starts(torch.bincount(outputs, minlength=num_outputs))
+    number = len(inputs) // _BLOCK_PAIRS + 1
+    first_rows = torch.searchsorted(starts, torch.arange(number, device=starts.device) * _BLOCK_PAIRS)
+    sizes = _run_sizes(outputs, counts, first_rows)
+    inputs, outputs = _by_block(inputs, sizes), _by_block(outputs, sizes)
+    totals = [sum(runs) for runs in sizes]
+    rows = [slice(*ends) for ends in pairwise([*first_rows.tolist(), num_outputs])]
+    parts = zip(rows, inputs.split_with_sizes(totals), outputs.split_with_sizes(totals), sizes, strict=True)
+    known = order if number == 1 else None
+    blocks = tuple(_block(r, i, o, elements, runs, starts, known) for r, i, o, runs in parts)
+    return Rulebook(inputs, outputs, blocks, num_inputs, num_outputs, volume, symmetric)
 
 
-_Run = tuple[Tensor, Tensor, int, int]  # inputs, outputs, kernel element, pairs
+def _run_sizes(outputs: Tensor, counts: Sequence[int], first_rows: Tensor) -> list[list[int]]:
+    """Of each block, how many pairs of each group reach its rows."""
+    if len(first_rows) == 1 or not counts:
+        return [list(counts)] * len(first_rows)
+    begins = [torch.searchsorted(group, first_rows.int()) for group in outputs.split_with_sizes(tuple(counts))]
+    ends = torch.tensor(counts, device=first_rows.device)[:, None]
+    sizes: list[list[int]] = torch.cat([torch.stack(begins), ends], 1).diff(dim=1).t().tolist()
+    return sizes
+
+
+def _by_block(side: Tensor, sizes: Sequence[Sequence[int]]) -> Tensor:
+    """What is ordered by group and block in the order of block and group."""
+    if len(sizes) == 1:
+        return side
+    runs = side.split_with_sizes([size for group in zip(*sizes, strict=True) for size in group])
+    return torch.cat([run for block in range(len(sizes)) for run in runs[block :: len(sizes)]])
+
+
+def _block(
+    rows: slice,
+    inputs: Tensor,
+    outputs: Tensor,
+    elements: Sequence[int],
+    sizes: Sequence[int],
+    starts: Tensor,
+    order: Tensor | None,
+) -> Block:
+    groups = list(_batched([run for run in zip(elements, sizes, strict=True) if run[1]]))
+    totals = [sum(size for _, size in group) for group in groups]
+    parts = zip(inputs.split_with_sizes(totals), outputs.split_with_sizes(totals), groups, strict=True)
+    batches = tuple(Batch(i, o, tuple(e for e, _ in group), tuple(n for _, n in group)) for i, o, group in parts)
+    order, own = _order(outputs, rows) if order is None else order, starts[rows.start : rows.stop + 1]
+    return Block(rows, inputs, batches, order.int(), (own - own[0]).int())
+
+
+def _order(outputs: Tensor, rows: slice) -> Tensor:
+    """The pairs sorted by output row, stably."""
+    if rows.stop - rows.start < 2**15:  # fewer digits for the radix sort
+        outputs = (outputs - rows.start).short()
+    return torch.sort(outputs, stable=True)[1]
+
+
+_Run = tuple[int, int]  # kernel element, pairs
 
 
 def _batched(runs: Sequence[_Run]) -> Iterator[list[_Run]]:
     """The runs in order, as many together as make `_BATCH_PAIRS` pairs at most, but at least one."""
     batch: list[_Run] = []
     for run in runs:
-        if batch and sum(size for *_, size in batch) + run[-1] > _BATCH_PAIRS:
+        if batch and sum(size for _, size in batch) + run[1] > _BATCH_PAIRS:
             yield batch
             batch = []
         batch.append(run)
     if batch:
         yield batch
-
-
-def _batch(runs: Sequence[_Run]) -> Batch:
-    inputs, outputs, elements, sizes = zip(*runs, strict=True)
-    return Batch(torch.cat(inputs), torch.cat(outputs), elements, sizes)
 
 
 @dataclass
@@ -231,10 +275,8 @@ def _make_submanifold(sites: _Sites, voxels: Voxels, kernel: Kernel) -> Rulebook
     half = range(kernel.volume // 2 + 1, kernel.volume)
     rows, neighbours, counts = _find(keys, [shifts[e] for e in half], cells)
     elements = (*half, *(kernel.volume - 1 - e for e in half))
-    return Rulebook(
-        torch.cat([neighbours, rows]), torch.cat([rows, neighbours]), elements, counts * 2, len(keys), len(keys),
-        kernel.volume, True,
-    )  # fmt: skip
+    inputs, outputs = torch.cat([neighbours, rows]), torch.cat([rows, neighbours])
+    return make_rulebook(inputs, outputs, elements, counts * 2, len(keys), len(keys), kernel.volume, True)
 
 
 def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tensor, tuple[int, ...]]:
@@ -245,13 +287,17 @@ def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tens
     wanted = (keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]).view(-1)
     neighbour = _look_up(keys, wanted, cells)
     neighbour = neighbour.view(len(shifts), -1)
-    rows = [hit.nonzero().squeeze(1) for hit in neighbour >= 0]
-    found = [line.index_select(0, row) for line, row in zip(neighbour, rows, strict=True)]
-    return torch.cat(rows).int(), torch.cat(found), tuple(map(len, rows))
+    hit = neighbour >= 0
+    counts = tuple(hit.sum(1).tolist())
+    rows = hit.view(-1).nonzero().squeeze(1).int()
+    found = neighbour.view(-1).index_select(0, rows)
+    for group, own in enumerate(rows.split_with_sizes(counts)):
+        own.sub_(group * len(keys))
+    return rows, found, counts
 
 
 def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
-    """Row (K,) int32 of `keys` (N,), which ascend, that equals each of `wanted` (K,), or -1.
+    """Row (K,) int32 of `keys` (N,), which ascend, that equals each of `wanted` (K,), or -1; overwrites `wanted`.
 
     Two tables: the first numbers those of at most `_TABLE` equal chunks of the key space that hold a key, the
     second holds the rows, cell by cell, of the numbered chunks. Both fit a processor's cache where one table
@@ -268,7 +314,7 @@ def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
     inside = (1 << bits) - 1
     cell.scatter_(0, (number.long() << bits) + (keys & inside), rows)
     place = numbers.index_select(0, wanted >> bits).bitwise_left_shift_(bits)
-    found = cell.index_select(0, place.add_(wanted & inside))
+    found = cell.index_select(0, place.add_(wanted.bitwise_and_(inside)))
     numbers.index_fill_(0, written, 0)
     return found
 
@@ -334,8 +380,7 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     row = first.cumsum(0, dtype=torch.int32) - 1
     unique, outputs = torch.masked_select(key, first), torch.empty_like(row).scatter_(0, order, row)
     inputs = (flat % max(len(b), 1)).int()
-    elements = tuple(range(kernel.volume))
-    book = Rulebook(inputs, outputs, elements, counts, len(b), len(unique), kernel.volume)
+    book = make_rulebook(inputs, outputs, range(kernel.volume), counts, len(b), len(unique), kernel.volume, order=order)
     columns = cell_columns(unique, shape)
     index = cell_index(columns)
     return StridedRulebook(book, index, shape, {"sites": _Sites(index, columns)})

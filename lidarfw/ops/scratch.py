@@ -12,6 +12,8 @@ import threading
 import torch
 from torch import Tensor
 
+_STEP = 2**18  # elements: what is a little larger than before fits too
+
 _local = threading.local()
 
 
@@ -35,5 +37,5 @@ def _buffer(purpose: str, size: int, dtype: torch.dtype, zero: bool = False) -> 
     key = (purpose, dtype)
     if key not in buffers or len(buffers[key]) < size:
         buffers.pop(key, None)  # give the old one back first
-        buffers[key] = (torch.zeros if zero else torch.empty)(size, dtype=dtype)
+        buffers[key] = (torch.zeros if zero else torch.empty)(-(-size // _STEP) * _STEP, dtype=dtype)
     return buffers[key]

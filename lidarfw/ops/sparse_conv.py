@@ -41,9 +41,9 @@ def convolve(
         bias: (C_out,) added to every row.
         rectify: set what is negative to 0, while the block is in the cache.
     """
-    blocks, weights = book.blocks(), weight.unbind()
+    weights = weight.unbind()
     output = features.new_empty(book.num_outputs, weight.shape[2])
-    for block in blocks:
+    for block in book.blocks:
         products = scratch("products", block.pairs + SLACK, weight.shape[2], features)
         rows = scratch("rows", block.largest + SLACK, weight.shape[1], features)
         for done, batch in _batches(block):
@@ -54,7 +54,7 @@ def convolve(
             add_product(features[block.rows], weights[book.volume // 2], total)
         total = total if bias is None else total.add_(bias)
         total = total.relu_() if rectify else total
-        if len(blocks) == 1:
+        if len(book.blocks) == 1:
             return total
         output[block.rows] = total
     return output
@@ -96,7 +96,7 @@ def _gradients(
     flipped = weight.transpose(1, 2).contiguous().unbind()
     d_features = torch.empty_like(features) if need_features else None
     d_weight = torch.zeros_like(weight) if need_weight else None
-    for block in book.blocks():
+    for block in book.blocks:
         products = scratch("products", block.pairs + SLACK, weight.shape[1], gradient)
         _block_gradients(block, features, gradient, flipped, products if need_features else None, d_weight)
         if d_features is not None:

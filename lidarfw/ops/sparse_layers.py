@@ -66,10 +66,9 @@ class _PairSum(torch.autograd.Function):
 
 def _pair_sum(features: Tensor, book: Rulebook) -> Tensor:
     sums = []
-    for block in book.blocks():
-        inputs = torch.cat([book.inputs[:0], *(batch.inputs for batch in block.batches)])
+    for block in book.blocks:
         rows = scratch("products", block.pairs, features.shape[1], features)
-        sums.append(sum_block(block, torch.index_select(features, 0, inputs, out=rows)))
+        sums.append(sum_block(block, torch.index_select(features, 0, block.inputs, out=rows)))
     return torch.cat(sums)
 
 

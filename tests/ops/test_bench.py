@@ -1,6 +1,7 @@
 """The naive yardsticks agree with the ops, and `lidarfw bench` measures and reports."""
 
 import json
+from pathlib import Path
 import math
 
 import pytest
@@ -150,3 +151,12 @@ def test_bench_of_a_model_times_its_components(tmp_path, capsys) -> None:
 def test_bench_of_a_model_that_sees_pictures_asks_for_one(capsys) -> None:
     assert main(["bench", "dataset.synthetic.image=true", "backbone=resnet", "neck=lift", "head=center"]) == 2
     assert "--image FILE" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="needs Linux' /proc")
+def test_peak_memory_is_that_of_a_pass() -> None:
+    found = bench.peak_memory("ours", sweeps=1)
+    assert found is not None
+    peak, kernels = found
+    assert 10 < peak < 300  # the features alone: 18,601 x 16 x 4 bytes and more on the other levels
+    assert 0 <= kernels < 300
