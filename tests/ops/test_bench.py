@@ -1,8 +1,8 @@
 """The naive yardsticks agree with the ops, and `lidarfw bench` measures and reports."""
 
 import json
-from pathlib import Path
 import math
+from pathlib import Path
 
 import pytest
 import torch
