@@ -286,11 +286,10 @@ def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tens
         return none, none, (0,) * len(shifts)
     wanted = (keys + torch.tensor(shifts, dtype=keys.dtype, device=keys.device)[:, None]).view(-1)
     neighbour = _look_up(keys, wanted, cells)
-    neighbour = neighbour.view(len(shifts), -1)
-    hit = neighbour >= 0
-    counts = tuple(hit.sum(1).tolist())
-    rows = hit.view(-1).nonzero().squeeze(1).int()
-    found = neighbour.view(-1).index_select(0, rows)
+    place = (neighbour >= 0).nonzero().squeeze(1)
+    ends = torch.searchsorted(place, torch.arange(len(shifts) + 1, device=place.device) * len(keys))
+    counts = tuple(ends.diff().tolist())
+    found, rows = neighbour.index_select(0, place), place.int()
     for group, own in enumerate(rows.split_with_sizes(counts)):
         own.sub_(group * len(keys))
     return rows, found, counts
@@ -306,16 +305,16 @@ def _look_up(keys: Tensor, wanted: Tensor, cells: int) -> Tensor:
     bits = ((cells - 1) // _TABLE).bit_length()
     chunk, rows = keys >> bits, torch.arange(len(keys), dtype=torch.int32, device=keys.device)
     number = F.pad((chunk[1:] != chunk[:-1]).cumsum(0, dtype=torch.int32), (1, 0)) + 1
-    if len(keys) << bits > _TABLE * 64 and (int(number[-1]) + 1) << bits > _TABLE * 64:
+    size = (int(number[-1]) + 1) << bits
+    if size > _TABLE * 64:
         return _search(keys, wanted)
-    written = chunk.long()
-    numbers = zeroed("chunks", (cells >> bits) + 1, rows).scatter_(0, written, number)
-    cell = scratch("cells", (int(number[-1]) + 1) << bits, 1, rows).view(-1).fill_(-1)
-    inside = (1 << bits) - 1
-    cell.scatter_(0, (number.long() << bits) + (keys & inside), rows)
-    place = numbers.index_select(0, wanted >> bits).bitwise_left_shift_(bits)
+    begin, written, inside = number << bits, chunk.long(), (1 << bits) - 1
+    begins = zeroed("chunks", (cells >> bits) + 1, rows).scatter_(0, written, begin)
+    cell = scratch("cells", size, 1, rows).view(-1).fill_(-1)
+    cell.scatter_(0, (begin + (keys & inside)).long(), rows)
+    place = begins.index_select(0, wanted >> bits)
     found = cell.index_select(0, place.add_(wanted.bitwise_and_(inside)))
-    numbers.index_fill_(0, written, 0)
+    begins.index_fill_(0, written, 0)
     return found
 
 
@@ -379,7 +378,7 @@ def _make_strided(sites: _Sites, voxels: Voxels, kernel: Kernel) -> StridedRuleb
     first = F.pad(key[1:] != key[:-1], (1, 0), value=True)[: len(key)]  # of the pairs of an output
     row = first.cumsum(0, dtype=torch.int32) - 1
     unique, outputs = torch.masked_select(key, first), torch.empty_like(row).scatter_(0, order, row)
-    inputs = (flat % max(len(b), 1)).int()
+    inputs = flat.int() % max(len(b), 1)
     book = make_rulebook(inputs, outputs, range(kernel.volume), counts, len(b), len(unique), kernel.volume, order=order)
     columns = cell_columns(unique, shape)
     index = cell_index(columns)
