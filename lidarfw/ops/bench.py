@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from lidarfw import ops
 from lidarfw.ops import naive, rivals, sparse_conv
 from lidarfw.ops.inputs import random_boxes, street_scan
-from lidarfw.ops.product import compile_kernels
 from lidarfw.ops.rulebook import Kernel, strided_rulebook, submanifold_rulebook
 from lidarfw.types import Grid, Points, RangeView, SceneCoords, Voxels
 
@@ -299,21 +298,17 @@ def growth(rounds: int) -> dict[str, float]:
 
 
 def _peak(engine: str, sweeps: int, threads: int, answer: Any) -> None:
-    """Send what `peak_memory` returns; runs in its own process."""
+    """Send MB of resident memory that one forward pass takes above what stood before; runs in its own process."""
     torch.set_num_threads(threads)
     voxels = ops.voxelize_mean(street_scan(sweeps, math.radians(41 if sweeps == 1 else 90)), GRID)
     channels = voxels.features.shape[1]
     net = (backbone(channels) if engine == "ours" else rivals.spconv_backbone(CHANNELS, channels)).eval()
-    torch.mm(torch.randn(500, 64), torch.randn(64, 64))  # the libraries' own working memory is no part of it,
-    start = _status("VmRSS")
-    for layer in net.modules():
-        if isinstance(layer, sparse_conv.SparseConvolution):
-            compile_kernels(layer.weight.detach()[0])  # nor is what oneDNN compiles
+    torch.mm(torch.randn(500, 64), torch.randn(64, 64))  # the libraries' own working memory is no part of it
     Path("/proc/self/clear_refs").write_text("5")
     before = _status("VmRSS")
     with torch.no_grad():
         net(fresh(voxels) if engine == "ours" else rivals.spconv_tensor(voxels))
-    answer.send(((_status("VmHWM") - before) / 1024, (before - start) / 1024))
+    answer.send((_status("VmHWM") - before) / 1024)
 
 
 def _status(name: str) -> int:
@@ -322,11 +317,8 @@ def _status(name: str) -> int:
     return next(int(line.split()[1]) for line in lines if line.startswith(name))
 
 
-def peak_memory(engine: str, sweeps: int, threads: int = 1) -> tuple[float, float] | None:
-    """MB that the backbone's forward pass of `engine` (ours or spconv) takes at most, and that its kernels take.
-
-    The kernels are compiled once per process; MB of them are 0 where nothing is compiled. None without Linux' /proc.
-    """
+def peak_memory(engine: str, sweeps: int, threads: int = 1) -> float | None:
+    """MB that the backbone's forward pass of `engine` (ours or spconv) takes; None where there is no Linux /proc."""
     if not Path("/proc/self/clear_refs").exists():
         return None
     context = multiprocessing.get_context("spawn")
@@ -334,9 +326,9 @@ def peak_memory(engine: str, sweeps: int, threads: int = 1) -> tuple[float, floa
     process = context.Process(target=_peak, args=(engine, sweeps, threads, send))
     process.start()
     send.close()
-    peak, kernels = receive.recv()
+    value = float(receive.recv())
     process.join()
-    return float(peak), float(kernels)
+    return value
 
 
 def machine() -> dict[str, Any]:
@@ -390,10 +382,8 @@ def _figures(against: set[str], rounds: int) -> dict[str, float]:
             flops(fresh(voxels)) / (statistics.median(times) / 1e3) / rate
         )
         for engine in ("ours", *({"spconv"} & against)):
-            memory = peak_memory(engine, sweeps)
-            if memory is not None:
-                figures[f"peak MB of the forward pass, {engine} ({name})"] = memory[0]
-                figures |= {f"MB of kernels compiled once per process ({name})": memory[1]} if engine == "ours" else {}
+            peak = peak_memory(engine, sweeps)
+            figures |= {} if peak is None else {f"peak MB of the forward pass, {engine} ({name})": peak}
     return figures | growth(rounds)
 
 

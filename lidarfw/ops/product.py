@@ -21,8 +21,8 @@ from torch import Tensor
 
 from lidarfw.ops.scratch import scratch
 
-_KERNELS: tuple[int, ...] = (*range(512, 4097, 512), *range(5120, 8193, 1024))  # numbers of rows that oneDNN gets
-SLACK = 1024  # rows that matrices must have behind the last group: the largest gap between the numbers
+_KERNELS: tuple[int, ...] = (*range(512, 4097, 512), 6144, 8192)  # numbers of rows that oneDNN gets
+SLACK = 2048  # rows that matrices must have behind the last group: the largest gap between the numbers
 _WORTH = 32 * 32  # elements of a weight from which oneDNN is faster
 _WORTH_TRANSPOSED = 32 * 64  # the same where it is the rows that are summed over
 
@@ -53,23 +53,19 @@ def multiply(rows: Tensor, sizes: Sequence[int], weights: Sequence[Tensor], out:
                 torch.mm(rows[stretch], weight, out=out[stretch])
 
 
-def compile_kernels(weight: Tensor) -> None:
-    """Compile all that `multiply` needs for matrices like `weight` (C_in, C_out); else the first products do so."""
-    for count in _KERNELS:
-        rows, out = (weight.new_zeros(count + SLACK, channels) for channels in weight.shape)
-        multiply(rows, (count,), (weight,), out)
-
-
 def add_product(rows: Tensor, weight: Tensor, out: Tensor) -> None:
-    """out (N, C_out) += rows (N, C_in) @ weight (C_in, C_out); as of `multiply`, a row's result is its own."""
+    """out (N, C_out) += rows (N, C_in) @ weight (C_in, C_out); as of `multiply`, a row's result is its own.
+
+    Overwrites the scratch matrices "rows" and "products".
+    """
     if weight.numel() < _WORTH or not _is_for_onednn(rows):
         out.addmm_(rows, weight)
         return
     with _onednn():
         for own, result in zip(torch.split(rows, _KERNELS[-1]), torch.split(out, _KERNELS[-1])):
-            whole = scratch("whole", _rounded_up(len(own)), rows.shape[1], rows)
+            whole = scratch("rows", _rounded_up(len(own)), rows.shape[1], rows)
             whole[: len(own)] = own
-            result += torch.mm(whole, weight, out=scratch("product", len(whole), out.shape[1], out))[: len(own)]
+            result += torch.mm(whole, weight, out=scratch("products", len(whole), out.shape[1], out))[: len(own)]
 
 
 def add_transposed_product(rows: Tensor, others: Tensor, sizes: Sequence[int], outs: Sequence[Tensor]) -> None:

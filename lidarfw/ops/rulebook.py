@@ -275,8 +275,10 @@ def _make_submanifold(sites: _Sites, voxels: Voxels, kernel: Kernel) -> Rulebook
     half = range(kernel.volume // 2 + 1, kernel.volume)
     rows, neighbours, counts = _find(keys, [shifts[e] for e in half], cells)
     elements = (*half, *(kernel.volume - 1 - e for e in half))
-    inputs, outputs = torch.cat([neighbours, rows]), torch.cat([rows, neighbours])
-    return make_rulebook(inputs, outputs, elements, counts * 2, len(keys), len(keys), kernel.volume, True)
+    return make_rulebook(
+        torch.cat([neighbours, rows]), torch.cat([rows, neighbours]), elements, counts * 2, len(keys), len(keys),
+        kernel.volume, True,
+    )  # fmt: skip
 
 
 def _find(keys: Tensor, shifts: Sequence[int], cells: int) -> tuple[Tensor, Tensor, tuple[int, ...]]:

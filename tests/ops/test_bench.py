@@ -155,8 +155,6 @@ def test_bench_of_a_model_that_sees_pictures_asks_for_one(capsys) -> None:
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="needs Linux' /proc")
 def test_peak_memory_is_that_of_a_pass() -> None:
-    found = bench.peak_memory("ours", sweeps=1)
-    assert found is not None
-    peak, kernels = found
+    peak = bench.peak_memory("ours", sweeps=1)
+    assert peak is not None
     assert 10 < peak < 300  # the features alone: 18,601 x 16 x 4 bytes and more on the other levels
-    assert 0 <= kernels < 300
