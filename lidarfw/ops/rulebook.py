@@ -24,7 +24,7 @@ from lidarfw.types import Voxels
 Triple = tuple[int, int, int]
 
 _TABLE = 2**21  # chunks of the key space that the first lookup table counts: 8 MB
-_BLOCK_PAIRS = 3 * 2**15  # pairs computed at a time: their products, 32 MB at 64 channels, stay in the cache
+_BLOCK_PAIRS = 3 * 2**15  # pairs computed at a time: their products, 24 MB at 64 channels, stay in the cache
 _BATCH_PAIRS = 2**14  # pairs whose rows are gathered by one call, where several kernel elements have so few
 
 
@@ -132,8 +132,7 @@ class Rulebook:
             sides = (side.split_with_sizes(batch.sizes) for side in (batch.inputs, batch.outputs))
             for element, run in zip(batch.elements, zip(*sides, strict=True), strict=True):
                 runs.setdefault(element, []).append(run)
-        whole = {element: [torch.cat(side) for side in zip(*runs[element], strict=True)] for element in sorted(runs)}
-        return {element: (inputs, outputs) for element, (inputs, outputs) in whole.items()}
+        return {e: (torch.cat([i for i, _ in runs[e]]), torch.cat([o for _, o in runs[e]])) for e in sorted(runs)}
 
     def pairs_per_output(self) -> Tensor:
         """(num_outputs,) int64."""
